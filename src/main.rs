@@ -1,0 +1,53 @@
+//! `maille`: the command. Reads the command line and hands over to one file a subcommand in [`commands`].
+
+mod commands;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// Surgery simulated by touch on a patient's own CT, without making a mesh.
+///
+/// Without a subcommand the default scene runs: a made patient, a scripted endoscope, and a page on 127.0.0.1.
+#[derive(Parser)]
+#[command(name = "maille", version, propagate_version = true, max_term_width = 110)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Option<Command>,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Run(commands::run::Args),
+    Service(commands::service::Args),
+    Check(commands::check::Args),
+    Info(commands::info::Args),
+    Import(commands::import::Args),
+    Deform(commands::deform::Args),
+    Render(commands::render::Args),
+    Surface(commands::surface::Args),
+    Doctor(commands::doctor::Args),
+    Clean(commands::clean::Args),
+}
+
+fn main() -> ExitCode {
+    let command = CommandLine::parse().command.unwrap_or_else(|| Command::Run(commands::run::Args::default()));
+    let outcome = match command {
+        Command::Run(args) => commands::run::run(&args),
+        Command::Service(args) => commands::service::run(&args),
+        Command::Check(args) => commands::check::run(&args),
+        Command::Info(args) => commands::info::run(&args),
+        Command::Import(args) => commands::import::run(&args),
+        Command::Deform(args) => commands::deform::run(&args),
+        Command::Render(args) => commands::render::run(&args),
+        Command::Surface(args) => commands::surface::run(&args),
+        Command::Doctor(args) => commands::doctor::run(&args),
+        Command::Clean(args) => commands::clean::run(&args),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("{failure}");
+            ExitCode::from(failure.status())
+        }
+    }
+}
