@@ -1,1 +1,24 @@
-//! Placeholder: replaced by the part's first commit.
+//! Scenes: TOML → what to simulate → the plan of processes, memory and stages.
+//!
+//! A [`Scene`] is plain data with every default filled in. [`Scene::load`] and [`Scene::parse`] refuse what they do not
+//! understand, pointing at the line and saying what was probably meant ([`SceneError`]). The plan derives from a
+//! scene what exists at run time, through the registry of effects and knobs; an effect that is not asked for appears nowhere
+//! in it.
+//!
+//! Invariants: [`Scene::load`] is the only code here that opens a file; no code here reads a clock. Units: mm, N, s, HU;
+//! positions in patient coordinates (LPS).
+
+#![forbid(unsafe_code)]
+
+pub mod path;
+pub mod scene;
+pub mod sections;
+pub mod suggest;
+pub mod tissue;
+pub mod tool;
+
+pub use path::{BoxMm, ToolPose, Waypoint};
+pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
+pub use sections::{CameraKind, Console, Deformation, Haptic, Memory, Mode, Pins, Push, Rendering};
+pub use tissue::Tissue;
+pub use tool::{Approach, Device, Hand, PathPoint, Tool, ToolKind};

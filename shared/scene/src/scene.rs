@@ -1,0 +1,214 @@
+//! A scene as it stands in its file: plain data, with what the file leaves out filled in.
+
+use crate::{
+    sections::{Console, Deformation, Haptic, Memory, Rendering},
+    tissue::{self, Tissue},
+    tool::Tool,
+};
+use serde::{Deserialize, Serialize};
+use std::{collections::BTreeMap, path::PathBuf};
+
+/// How accurate the scene wants to be: sets the default of every knob.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Accuracy {
+    /// fastest
+    Draft,
+    /// between
+    #[default]
+    Balanced,
+    /// as good as the engines can
+    Reference,
+}
+
+impl Accuracy {
+    /// 0, 1, 2: where this setting stands in a knob's list of defaults.
+    pub fn index(self) -> usize {
+        self as usize
+    }
+
+    /// The word in the scene file.
+    pub fn name(self) -> &'static str {
+        ["draft", "balanced", "reference"][self.index()]
+    }
+}
+
+/// A patient made by formula.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PhantomKind {
+    /// skin, skull, nose, sinus, brain, vessels
+    #[default]
+    Head,
+    /// skin, fat, ribs, lungs, diaphragm, liver, spine
+    Torso,
+}
+
+/// Number of voxels of a made patient: one number for a cube of voxels, or three.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Size {
+    /// the same along x, y, z
+    Cube(usize),
+    /// along x, y, z
+    Box([usize; 3]),
+}
+
+impl Size {
+    /// Along x, y, z.
+    pub fn xyz(self) -> [usize; 3] {
+        match self {
+            Self::Cube(n) => [n; 3],
+            Self::Box(size) => size,
+        }
+    }
+}
+
+/// `[volume]`: a file or a made patient.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct VolumeSection {
+    /// volume file or DICOM directory; in the file relative to the scene file, else to the working directory
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub file: Option<PathBuf>,
+    /// which patient is made when there is no file
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub phantom: Option<PhantomKind>,
+    /// voxels of the made patient, 16 to 2048 an axis
+    pub size: Size,
+    /// seed of the made patient's texture
+    pub seed: u64,
+}
+
+impl Default for VolumeSection {
+    fn default() -> Self {
+        Self { file: None, phantom: None, size: Size::Cube(256), seed: 1 }
+    }
+}
+
+/// Where the voxels come from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum VolumeSource {
+    /// a file to read
+    File(PathBuf),
+    /// a patient to make
+    Phantom {
+        /// which
+        kind: PhantomKind,
+        /// voxels along x, y, z
+        size: [usize; 3],
+        /// seed of its texture
+        seed: u64,
+    },
+}
+
+impl VolumeSection {
+    /// The file if there is one, else the made patient (the head when nothing is said).
+    pub fn source(&self) -> VolumeSource {
+        match &self.file {
+            Some(file) => VolumeSource::File(file.clone()),
+            None => VolumeSource::Phantom { kind: self.phantom.unwrap_or_default(), size: self.size.xyz(), seed: self.seed },
+        }
+    }
+}
+
+/// What the scene says of one effect: on, off, or on with settings of its own.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum EffectSetting {
+    /// on or off
+    Switch(bool),
+    /// on, with settings; `enabled = false` in it turns the effect off
+    Settings(toml::Table),
+}
+
+impl EffectSetting {
+    /// Whether the effect is asked for.
+    pub fn is_on(&self) -> bool {
+        match self {
+            Self::Switch(on) => *on,
+            Self::Settings(table) => table.get("enabled").and_then(toml::Value::as_bool).unwrap_or(true),
+        }
+    }
+}
+
+/// A scene: everything the supervisor and the services are told.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Scene {
+    /// one short name
+    pub name: String,
+    /// one sentence
+    pub description: String,
+    /// sets the default of every knob
+    pub accuracy: Accuracy,
+    /// where the voxels come from
+    pub volume: VolumeSection,
+    /// what is held and what moves it; none: no haptic process
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tool: Option<Tool>,
+    /// ChainMail and the mapper
+    pub deformation: Deformation,
+    /// loop, contact, limits of the device
+    pub haptic: Haptic,
+    /// ray caster and sections
+    pub rendering: Rendering,
+    /// the page
+    pub console: Console,
+    /// the brick store
+    pub memory: Memory,
+    /// what the scene calls for: effect → on, off or settings; what is not named is off
+    pub effects: BTreeMap<String, EffectSetting>,
+    /// mechanical laws by HU, ascending
+    #[serde(rename = "tissue")]
+    pub tissues: Vec<Tissue>,
+}
+
+impl Default for Scene {
+    fn default() -> Self {
+        Self {
+            name: "unnamed".into(),
+            description: String::new(),
+            accuracy: Accuracy::Balanced,
+            volume: VolumeSection::default(),
+            tool: None,
+            deformation: Deformation::default(),
+            haptic: Haptic::default(),
+            rendering: Rendering::default(),
+            console: Console::default(),
+            memory: Memory::default(),
+            effects: BTreeMap::new(),
+            tissues: tissue::defaults(),
+        }
+    }
+}
+
+impl Scene {
+    /// Whether the scene calls for an effect by its name in `[effects]` (or, for `contact`, by having a `[tool]`).
+    pub fn has_effect(&self, name: &str) -> bool {
+        match name {
+            "contact" => self.tool.is_some(),
+            "view" => true,
+            _ => self.effects.get(name).is_some_and(EffectSetting::is_on),
+        }
+    }
+
+    /// Puts another volume in, as `--volume` does. Way points and eye in the scene's own millimetres mean nothing in
+    /// it: where the scene has an approach, it takes the way points' place, and the camera frames the new box.
+    pub fn replace_volume(&mut self, file: PathBuf) {
+        self.volume.file = Some(file);
+        self.volume.phantom = None;
+        if let Some(tool) = &mut self.tool
+            && tool.approach.is_some()
+        {
+            tool.path.clear();
+        }
+        self.rendering.eye = None;
+        self.rendering.target = None;
+    }
+
+    /// The scene as TOML, every field written out: what the supervisor hands to the services.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a scene holds nothing that TOML cannot say: strings, numbers, tables")
+    }
+}

@@ -1,0 +1,247 @@
+//! The tables of a scene that set up the engines: deformation, haptics, rendering, console, memory.
+//!
+//! Every field has a default, a unit in its name or its text, and a range that [`crate::limits`] checks at loading.
+//! Fields that are knobs take their default from the scene's `accuracy` ([`crate::registry::KNOBS`]).
+
+use serde::{Deserialize, Serialize};
+
+/// How a push that tissue cannot follow is made admissible.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Push {
+    /// the whole push is shortened along its direction
+    Scale,
+    /// each component is clamped for itself: moves most, may turn the direction
+    #[default]
+    Clamp,
+}
+
+/// Which elements a push takes hold of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Pins {
+    /// the eight elements that enclose the tip
+    #[default]
+    Enclosing,
+    /// all elements inside the tip's sphere
+    Sphere,
+}
+
+/// `[deformation]`: ChainMail and the mapper.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Deformation {
+    /// link limit as a part of the link's length, 0.01 to 0.99; below 1/3 the deformation is one-to-one
+    pub offset: f64,
+    /// stiffer where denser: limit · (1 − (v/4096)²) with v = HU + 1000 held within 0 … 4095
+    pub density_scaling: bool,
+    /// tissue begins here [HU]: the live isovalue of links, contact and surface
+    pub threshold_hu: f64,
+    /// bone begins here [HU]: it does not move
+    pub bone_hu: f64,
+    /// no element moves further than this [mm], 0.1 to 100
+    pub movement_limit_mm: f64,
+    /// how an inadmissible push is made admissible
+    pub push: Push,
+    /// which elements a push holds
+    pub pins: Pins,
+    /// part of the tip's depth by which the tissue is moved, 0 to 1
+    pub push_scale: f64,
+    /// at most so many commits a second [Hz], 1 to 1000
+    pub rate_hz: f64,
+    /// threads of the process; by default a share of the machine's cores
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threads: Option<usize>,
+}
+
+impl Default for Deformation {
+    fn default() -> Self {
+        Self {
+            offset: 0.2,
+            density_scaling: true,
+            threshold_hu: -300.0,
+            bone_hu: 300.0,
+            movement_limit_mm: 20.0,
+            push: Push::Clamp,
+            pins: Pins::Enclosing,
+            push_scale: 1.0,
+            rate_hz: 60.0,
+            threads: None,
+        }
+    }
+}
+
+/// `[haptic]`: the 1 kHz loop, contact, and what the device may be given.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Haptic {
+    /// ticks a second [Hz], 100 to 4000
+    pub rate_hz: f64,
+    /// largest force put out [N], 0.1 to 40
+    pub max_force_n: f64,
+    /// largest change of force [N/s], 1 to 100 000 (0.1 N a tick at 1 kHz is 100)
+    pub max_slew_n_per_s: f64,
+    /// stiffness of the coupling between proxy and device [N/mm], 0.01 to 5; the tissue's own laws are in `[[tissue]]`
+    pub contact_stiffness_n_per_mm: f64,
+    /// damping of the coupling [N·s/mm], 0 to 0.1
+    pub contact_damping_n_s_per_mm: f64,
+    /// time in which the force grows from zero after a start [s], 0 to 10
+    pub ramp_s: f64,
+    /// time in which the force fades to zero when the deformation has been silent too long [s], 0 to 10
+    pub fade_s: f64,
+    /// a tool move is sent when the tip has moved so far since the last one [mm], 0 to 10
+    pub move_step_mm: f64,
+    /// states put out for others to draw [Hz], 1 to 1000
+    pub state_hz: f64,
+    /// core on which the loop is kept; by default any
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cpu: Option<usize>,
+    /// SCHED_FIFO priority asked for, 1 to 99; 0 asks for none
+    pub priority: u32,
+}
+
+impl Default for Haptic {
+    fn default() -> Self {
+        Self {
+            rate_hz: 1000.0,
+            max_force_n: 3.3,
+            max_slew_n_per_s: 100.0,
+            contact_stiffness_n_per_mm: 0.5,
+            contact_damping_n_s_per_mm: 0.001,
+            ramp_s: 0.5,
+            fade_s: 0.2,
+            move_step_mm: 0.1,
+            state_hz: 200.0,
+            cpu: None,
+            priority: 80,
+        }
+    }
+}
+
+/// What the 3D view shows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Mode {
+    /// direct volume rendering through the transfer function
+    #[default]
+    Volume,
+    /// the first hit of the surface at `deformation.threshold_hu`
+    Isosurface,
+}
+
+/// Where the 3D view is seen from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CameraKind {
+    /// outside, turned with the mouse
+    #[default]
+    Free,
+    /// at the tool's tip, looking along it
+    Endoscope,
+}
+
+/// `[rendering]`: the ray caster and the section views.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Rendering {
+    /// pixels of the 3D view, width and height, 16 to 4096
+    pub size: [usize; 2],
+    /// pixels of a section view, 16 to 4096
+    pub section_size: [usize; 2],
+    /// frames a second at most [Hz], 1 to 240
+    pub rate_hz: f64,
+    /// what the 3D view shows
+    pub mode: Mode,
+    /// preset (`ct`, `bone`, `soft`, `lung`) or a file with a transfer function
+    pub transfer: String,
+    /// where it is seen from
+    pub camera: CameraKind,
+    /// eye [mm, LPS]; by default placed on `from` so that the volume's box fills the view
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub eye: Option<[f64; 3]>,
+    /// looked-at point [mm, LPS]; by default `look_at`
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub target: Option<[f64; 3]>,
+    /// up, any length
+    pub up: [f64; 3],
+    /// vertical angle of view of the free camera [degrees], 1 to 170
+    pub fov_deg: f64,
+    /// vertical angle of view of the endoscope [degrees], 1 to 170
+    pub endoscope_fov_deg: f64,
+    /// direction from the looked-at point to the eye (LPS, any length), where `eye` is not given
+    pub from: [f64; 3],
+    /// looked-at point as a fraction of the box along the LPS axes, where `target` is not given
+    pub look_at: [f64; 3],
+    /// distance of the eye in units of the one at which the box just fills the view, 0.05 to 10
+    pub distance: f64,
+    /// sampling step along the ray, in units of the smallest spacing, 0.05 to 4 (a knob)
+    pub step: f64,
+    /// gradient shading
+    pub shading: bool,
+    /// a ray ends when this part of the light is used up, 0.5 to 1 (a knob)
+    pub opacity_end: f64,
+    /// window of the sections [HU]: centre and width
+    pub section_window_hu: [f64; 2],
+    /// threads of the process; by default a share of the machine's cores
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threads: Option<usize>,
+}
+
+impl Default for Rendering {
+    fn default() -> Self {
+        Self {
+            size: [640, 480],
+            section_size: [320, 240],
+            rate_hz: 30.0,
+            mode: Mode::Volume,
+            transfer: "ct".into(),
+            camera: CameraKind::Free,
+            eye: None,
+            target: None,
+            up: [0.0, 0.0, 1.0],
+            fov_deg: 30.0,
+            endoscope_fov_deg: 90.0,
+            from: [0.35, -1.0, 0.2],
+            look_at: [0.5, 0.5, 0.5],
+            distance: 1.0,
+            step: 1.0,
+            shading: true,
+            opacity_end: 0.99,
+            section_window_hu: [50.0, 800.0],
+            threads: None,
+        }
+    }
+}
+
+/// `[console]`: the page on 127.0.0.1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Console {
+    /// whether it starts at all (`--headless` turns it off)
+    pub enabled: bool,
+    /// TCP port; 0 takes any free one
+    pub port: u16,
+    /// quality of the JPEG frames, 10 to 100
+    pub jpeg_quality: u8,
+}
+
+impl Default for Console {
+    fn default() -> Self {
+        Self { enabled: true, port: 0, jpeg_quality: 85 }
+    }
+}
+
+/// `[memory]`: the brick store. What is not given, the plan works out.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Memory {
+    /// spare slots by memory [MiB]; at most one of `spare_mib` and `spare_slots`
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spare_mib: Option<u64>,
+    /// spare slots by number of bricks
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spare_slots: Option<usize>,
+    /// readers that may pin a snapshot at once, 1 to 64
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub readers: Option<usize>,
+}

@@ -1,0 +1,179 @@
+//! The tool: what is held, what moves it, and the way it goes when a script moves it.
+//!
+//! Positions are patient coordinates [mm, LPS] or fractions of the volume's box of voxel centres (0 at the low end of
+//! an LPS axis, 1 at the high end), so that one script serves volumes of any size. [`crate::path`] turns them into
+//! way points.
+
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// What kind of tool is held.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ToolKind {
+    /// a rigid endoscope: a sphere at the tip, and a camera with a light looking along it
+    #[default]
+    Endoscope,
+    /// a blunt probe: the same sphere, no camera
+    Probe,
+}
+
+/// What moves the tool; a string in the scene and on the command line.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Device {
+    /// `"path"`: the scene's own way points or approach; exactly followed
+    #[default]
+    Path,
+    /// `"path:FILE"`: way points from another scene-like file with `[[tool.path]]`
+    PathFile(PathBuf),
+    /// `"sim"`: a simulated hand (spring–damper) that follows the way points and yields to the force
+    Sim,
+    /// `"console"`: moved by dragging in the page; rests at the first way point until then
+    Console,
+}
+
+/// Devices that exist, for messages.
+pub const DEVICES: &[&str] = &["path", "sim", "console", "path:FILE"];
+
+impl TryFrom<String> for Device {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        match text.as_str() {
+            "path" => Ok(Self::Path),
+            "sim" => Ok(Self::Sim),
+            "console" => Ok(Self::Console),
+            "inverse3" => Err("the device `inverse3` is declared for later and not built yet; use `sim`, `path` or `console`".into()),
+            _ => match text.strip_prefix("path:") {
+                Some("") => Err("`path:` wants a file name after the colon".into()),
+                Some(file) => Ok(Self::PathFile(file.into())),
+                None => Err(crate::suggest::unknown("device", &text, DEVICES)),
+            },
+        }
+    }
+}
+
+impl From<Device> for String {
+    fn from(device: Device) -> Self {
+        match device {
+            Device::Path => "path".into(),
+            Device::PathFile(file) => format!("path:{}", file.display()),
+            Device::Sim => "sim".into(),
+            Device::Console => "console".into(),
+        }
+    }
+}
+
+/// `[tool]`: without this table no haptic process starts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tool {
+    /// what is held
+    pub kind: ToolKind,
+    /// radius of the spherical tip [mm], 0.1 to 20
+    pub radius_mm: f64,
+    /// what moves it
+    pub device: Device,
+    /// start again at the end of the path
+    #[serde(rename = "loop")]
+    pub looped: bool,
+    /// duration of one round when the path loops [s]; by default the last way point's time, and the way back to the
+    /// first at the path's mean speed when they differ
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub period_s: Option<f64>,
+    /// way points, times increasing; for the scene's own volume
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub path: Vec<PathPoint>,
+    /// a press found on the volume itself; used when there are no way points, and when `--volume` puts another volume in
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub approach: Option<Approach>,
+    /// the simulated hand of device `"sim"`
+    pub hand: Hand,
+}
+
+impl Default for Tool {
+    fn default() -> Self {
+        Self {
+            kind: ToolKind::Endoscope,
+            radius_mm: 2.0,
+            device: Device::Path,
+            looped: true,
+            period_s: None,
+            path: Vec::new(),
+            approach: None,
+            hand: Hand::default(),
+        }
+    }
+}
+
+/// `[[tool.path]]`: one way point; exactly one of `mm` and `fraction`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PathPoint {
+    /// when the tip is there [s], increasing along the path
+    pub time_s: f64,
+    /// where the tip's centre is [mm, LPS]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mm: Option<[f64; 3]>,
+    /// where the tip's centre is, as a fraction of the volume's box of voxel centres along the LPS axes
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fraction: Option<[f64; 3]>,
+    /// where the tool points, shaft to tip; any length; by default the direction of the path's first move inwards
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub direction: Option<[f64; 3]>,
+}
+
+/// `[tool.approach]`: go from `from` towards `toward`, find the first surface there, and press it again and again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Approach {
+    /// start of the search, a fraction of the box along the LPS axes; in air
+    pub from: [f64; 3],
+    /// end of the search, likewise
+    pub toward: [f64; 3],
+    /// corners on the way there (fractions), for passages that bend: the tool goes along them once, and the search is
+    /// on the last piece only
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub via: Vec<[f64; 3]>,
+    /// how deep the tip's front presses in below the surface [mm], 0.1 to 50
+    pub press_mm: f64,
+    /// how far before the surface the tip's front hovers [mm]
+    pub hover_mm: f64,
+    /// duration of one hover–press–hold–retreat [s], 0.2 to 600
+    pub period_s: f64,
+    /// sideways steps of successive presses, perpendicular to the approach [mm]; 0 presses one place
+    pub lateral_mm: f64,
+}
+
+impl Default for Approach {
+    fn default() -> Self {
+        Self {
+            from: [0.5, 0.0, 0.5],
+            toward: [0.5, 1.0, 0.5],
+            via: Vec::new(),
+            press_mm: 6.0,
+            hover_mm: 5.0,
+            period_s: 4.0,
+            lateral_mm: 0.0,
+        }
+    }
+}
+
+/// `[tool.hand]`: a spring–damper hand that holds the tool, m a = k (x_hand − x) − b v + F.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Hand {
+    /// grip [N/mm], 0.01 to 10
+    pub stiffness_n_per_mm: f64,
+    /// damping [N·s/mm], 0 to 1
+    pub damping_n_s_per_mm: f64,
+    /// moving mass of hand and handle [kg], 0.01 to 5
+    pub mass_kg: f64,
+}
+
+impl Default for Hand {
+    fn default() -> Self {
+        Self { stiffness_n_per_mm: 0.6, damping_n_s_per_mm: 0.01, mass_kg: 0.1 }
+    }
+}
