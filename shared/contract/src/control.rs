@@ -1,0 +1,222 @@
+//! The control block: life, time, pins, counters and last states, in one small segment that every process maps read-write.
+//!
+//! Atomics only. The supervisor creates it before any service starts and keeps it to the end; a service's death leaves
+//! its numbers standing, so that the report counts across restarts.
+
+use crate::{cell::LatestCell, clock::SimulationClock, histogram::SharedHistogram, messages::{ToolCommand, ToolState, ViewState}, names::PINS_PER_ROLE};
+use bytemuck::Zeroable;
+use core::sync::atomic::{AtomicU64, Ordering::{Acquire, Relaxed, Release}};
+
+/// "maille" and the version of this layout.
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille01");
+/// Pins in the block.
+pub const PINS: usize = 32;
+/// A pin that pins nothing.
+pub const PIN_IDLE: u64 = 0;
+/// A pin whose reader is about to choose an epoch: while it stands nothing is reclaimed.
+pub const PIN_PENDING: u64 = 1;
+/// A service that has not beaten for this long is shown as stopped [ns].
+pub const HEARTBEAT_LATE_NS: u64 = 500_000_000;
+/// The supervisor beats at least this often; a service that misses ten beats ends itself [ns].
+pub const SUPERVISOR_BEAT_NS: u64 = 50_000_000;
+
+const _: () = assert!(PINS_PER_ROLE * crate::Role::ALL.len() <= PINS);
+
+/// What the whole run is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u64)]
+pub enum RunState {
+    /// segments and services are being made
+    Starting = 0,
+    /// services run
+    Running = 1,
+    /// services should end now
+    Stopping = 2,
+}
+
+/// What a service is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u64)]
+pub enum ServiceState {
+    /// not part of this run, or not started yet
+    Absent = 0,
+    /// opening what it needs
+    Starting = 1,
+    /// in its loop
+    Ready = 2,
+    /// ended as asked
+    Ended = 3,
+}
+
+macro_rules! from_word {
+    ($t:ty, $($v:ident),+) => {
+        impl $t {
+            fn from_word(word: u64) -> Option<Self> {
+                [$(Self::$v),+].into_iter().find(|v| *v as u64 == word)
+            }
+        }
+    };
+}
+from_word!(RunState, Starting, Running, Stopping);
+from_word!(ServiceState, Absent, Starting, Ready, Ended);
+
+/// Meanings of [`ServiceCell::counters`]: one list for all services; what does not concern one stays 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(usize)]
+pub enum Counter {
+    /// loop iterations after warm-up (ticks, steps, frames)
+    Iterations = 0,
+    /// nanoseconds over which `Iterations` were counted
+    RecordedNs = 1,
+    /// periods of the loop that were missed and not caught up
+    Overruns = 2,
+    /// transactions committed (deformation)
+    Commits = 3,
+    /// elements moved, summed over commits (deformation)
+    MovedElements = 4,
+    /// transactions put off because no slot was free (deformation)
+    Deferred = 5,
+    /// messages refused because a number in them could not be used
+    Refused = 6,
+    /// allocations inside the guarded part of the loop (haptic)
+    Allocations = 7,
+    /// ticks in contact (haptic)
+    InContact = 8,
+    /// ticks in which a declared fallback was used: stale tissue, stale hand, invalid pose (haptic)
+    Degraded = 9,
+    /// voxels that the mapper could not invert and gave their nearest answer (deformation)
+    Failures = 10,
+    /// notices that real-time rights were missing (haptic)
+    NotRealtime = 11,
+    /// messages sent
+    Sent = 12,
+    /// bytes sent in frames (rendering)
+    BytesSent = 13,
+    /// tool moves received (deformation)
+    Received = 14,
+}
+
+/// Number of counters.
+pub const COUNTERS: usize = 16;
+
+/// One service's life and numbers. Writer: the service, but for `restarts` and `incarnation` (supervisor).
+#[repr(C)]
+#[derive(Zeroable)]
+pub struct ServiceCell {
+    /// process id; 0 before the first start
+    pub pid: AtomicU64,
+    /// counts the starts of the role, from 1
+    pub incarnation: AtomicU64,
+    /// starts after the first
+    pub restarts: AtomicU64,
+    state: AtomicU64,
+    /// CLOCK_MONOTONIC [ns] of the last beat
+    pub heartbeat_ns: AtomicU64,
+    /// CLOCK_MONOTONIC [ns] when this incarnation became ready
+    pub ready_ns: AtomicU64,
+    /// see [`Counter`]
+    pub counters: [AtomicU64; COUNTERS],
+    /// duration of an iteration: a tick's compute, a deformation step, a frame [ns]
+    pub duration: SharedHistogram,
+    /// how late an iteration began (haptic) [ns]
+    pub lateness: SharedHistogram,
+}
+
+impl ServiceCell {
+    /// What the service says it is doing.
+    pub fn state(&self) -> ServiceState {
+        ServiceState::from_word(self.state.load(Acquire)).unwrap_or(ServiceState::Absent)
+    }
+
+    /// Says what the service is doing.
+    pub fn set_state(&self, state: ServiceState) {
+        self.state.store(state as u64, Release);
+    }
+
+    /// Adds to a counter. Only one process at a time counts for a role.
+    #[inline]
+    pub fn count(&self, counter: Counter, n: u64) {
+        let word = &self.counters[counter as usize];
+        word.store(word.load(Relaxed) + n, Relaxed);
+    }
+
+    /// Reads a counter.
+    pub fn counter(&self, counter: Counter) -> u64 {
+        self.counters[counter as usize].load(Relaxed)
+    }
+}
+
+/// A pin on a cache line of its own: readers write theirs at every snapshot.
+#[repr(C, align(64))]
+#[derive(Zeroable)]
+pub struct Pin {
+    /// [`PIN_IDLE`], [`PIN_PENDING`], or the head word that is pinned
+    pub word: AtomicU64,
+}
+
+/// Words of a cell for `T`.
+const fn words<T>() -> usize {
+    size_of::<T>() / 8
+}
+
+/// The control block.
+#[repr(C)]
+#[derive(Zeroable)]
+pub struct ControlBlock {
+    /// [`CONTROL_MAGIC`], stored last by the supervisor
+    pub magic: AtomicU64,
+    /// bytes of the block, as its maker saw it
+    pub size_bytes: AtomicU64,
+    /// process id of the supervisor
+    pub supervisor_pid: AtomicU64,
+    /// CLOCK_MONOTONIC [ns] of the supervisor's last beat
+    pub supervisor_heartbeat_ns: AtomicU64,
+    state: AtomicU64,
+    /// port of the page on 127.0.0.1; 0 while there is none. Writer: console
+    pub console_port: AtomicU64,
+    /// smallest number of spare voxel slots seen so far. Writer: deformation
+    pub spare_slots_low: AtomicU64,
+    clock: LatestCell<{ words::<SimulationClock>() }>,
+    /// last pose and force. Writer: haptic
+    pub tool: LatestCell<{ words::<ToolState>() }>,
+    /// last view state. Writer: console (the supervisor before the first)
+    pub view: LatestCell<{ words::<ViewState>() }>,
+    /// last command to the tool. Writer: console
+    pub command: LatestCell<{ words::<ToolCommand>() }>,
+    /// one for each [`Role`](crate::Role)
+    pub services: [ServiceCell; 4],
+    /// pins of the store's readers; see [`Role::pins`](crate::Role::pins)
+    pub pins: [Pin; PINS],
+}
+
+impl ControlBlock {
+    /// Cell of a role.
+    pub fn service(&self, role: crate::Role) -> &ServiceCell {
+        &self.services[role as usize]
+    }
+
+    /// What the run is doing; an unknown word counts as stopping, the safe answer.
+    pub fn run_state(&self) -> RunState {
+        RunState::from_word(self.state.load(Acquire)).unwrap_or(RunState::Stopping)
+    }
+
+    /// Says what the run is doing. Supervisor only.
+    pub fn set_run_state(&self, state: RunState) {
+        self.state.store(state as u64, Release);
+    }
+
+    /// Simulation time [ns] at a reading of CLOCK_MONOTONIC; 0 before the clock is set.
+    pub fn time_ns(&self, monotonic_ns: u64) -> u64 {
+        self.clock.load::<SimulationClock>().map_or(0, |(clock, _)| clock.at(monotonic_ns))
+    }
+
+    /// Sets simulation time. Supervisor only.
+    pub fn set_clock(&self, clock: &SimulationClock) {
+        self.clock.store(clock);
+    }
+
+    /// Whether a service should end: the run stops, or the supervisor no longer beats.
+    pub fn should_end(&self, monotonic_ns: u64) -> bool {
+        self.run_state() == RunState::Stopping || monotonic_ns.saturating_sub(self.supervisor_heartbeat_ns.load(Relaxed)) > 10 * SUPERVISOR_BEAT_NS
+    }
+}

@@ -1,0 +1,224 @@
+//! Messages of iceoryx2's publish-subscribe.
+//!
+//! Positions are LPS millimetres in the patient's frame at rest (world = reference until a scene breathes), forces newtons,
+//! times simulation nanoseconds. A receiver treats what arrives as an allegation: `checked()` gives the message back
+//! only when every number is finite and in range.
+
+use bytemuck::{Pod, Zeroable};
+use iceoryx2::prelude::ZeroCopySend;
+
+/// Who sent a message, when, and which one it is.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.Stamp/v1")]
+pub struct Stamp {
+    /// simulation time [ns] at which the content held
+    pub time_ns: u64,
+    /// counts the sender's messages on this topic
+    pub sequence: u64,
+    /// counts the starts of the sender's role: a restarted peer is never taken for the old one
+    pub incarnation: u64,
+}
+
+/// The tool passes [`ToolState::flags`]: the tip is in contact.
+pub const TOOL_IN_CONTACT: u64 = 1;
+/// The console holds the tool.
+pub const TOOL_TAKEN_OVER: u64 = 1 << 1;
+/// The force is being faded: an input is stale or invalid.
+pub const TOOL_FADING: u64 = 1 << 2;
+
+/// Pose and force of the tool. Writer: haptic, a few hundred times a second. Readers: rendering, console.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.ToolState/v1")]
+pub struct ToolState {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// device tip [mm]
+    pub tip_mm: [f64; 3],
+    /// proxy: where the tip is held by the surface [mm]
+    pub proxy_mm: [f64; 3],
+    /// where the tool points, unit
+    pub direction: [f64; 3],
+    /// force on the hand [N]
+    pub force_n: [f64; 3],
+    /// depth of the tip below the surface [mm], 0 outside
+    pub penetration_mm: f64,
+    /// radius of the tip [mm]
+    pub radius_mm: f64,
+    /// `TOOL_…` bits
+    pub flags: u64,
+    /// epoch of the tissue that was felt
+    pub epoch: u64,
+}
+
+/// The tool has pressed in: tissue should give way. Writer: haptic. Reader: deformation.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.ToolMove/v1")]
+pub struct ToolMove {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// tip (the endoscope's eye) now [mm]
+    pub tip_mm: [f64; 3],
+    /// last position of the tip that was outside the tissue [mm]: where the search for the intersection ends
+    pub outside_mm: [f64; 3],
+    /// surface normal at the contact, unit, out of the tissue; zero when unknown
+    pub normal: [f64; 3],
+    /// radius of the tip [mm]
+    pub radius_mm: f64,
+}
+
+/// A new state of the tissue is visible. Writer: deformation, after the commit. Readers: rendering, haptic, console.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.Commit/v1")]
+pub struct Commit {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// epoch that the commit made
+    pub epoch: u64,
+    /// sequence of the tool move it answers
+    pub cause: u64,
+    /// elements moved
+    pub moved_elements: u64,
+    /// bricks rewritten
+    pub bricks: u64,
+    /// from the arrival of the tool move to the commit [ns]
+    pub step_ns: u64,
+    /// part of the push that bone or a movement limit refused [mm]
+    pub refused_mm: [f64; 3],
+}
+
+/// Points a transfer function sent by the page may have.
+pub const TRANSFER_POINTS: usize = 12;
+
+/// What the views show. Writer: console. Readers: rendering (all), deformation and haptic (threshold).
+///
+/// The whole state each time, so that only the latest matters.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.ViewState/v1")]
+pub struct ViewState {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// value where tissue begins (HU)
+    pub threshold_hu: f64,
+    /// 0 volume, 1 isosurface at the threshold
+    pub mode: u64,
+    /// 0 free camera, 1 at the endoscope's tip
+    pub camera: u64,
+    /// free camera's eye [mm]
+    pub eye_mm: [f64; 3],
+    /// free camera's target [mm]
+    pub target_mm: [f64; 3],
+    /// free camera's up, any length but zero
+    pub up: [f64; 3],
+    /// vertical field of view [degree]
+    pub fov_deg: f64,
+    /// centre of the sections' grey window (HU)
+    pub window_center_hu: f64,
+    /// width of the sections' grey window (HU), positive
+    pub window_width_hu: f64,
+    /// positions [mm] of the sagittal (x), coronal (y) and axial (z) sections
+    pub sections_mm: [f64; 3],
+    /// 1 while the sections follow the tool's tip
+    pub sections_follow_tool: u64,
+    /// number of transfer points in use; 0 keeps the scene's transfer function
+    pub transfer_count: u64,
+    /// HU, r, g, b (0–1), opacity over 1 mm; rising in HU
+    pub transfer: [[f64; 5]; TRANSFER_POINTS],
+}
+
+/// The page takes the tool, moves it, or lets it go. Writer: console. Reader: haptic.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.ToolCommand/v1")]
+pub struct ToolCommand {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// 1 while the page holds the tool
+    pub taken: u64,
+    /// where the hand wants the tip [mm]
+    pub target_mm: [f64; 3],
+    /// CLOCK_MONOTONIC [ns] when it was sent: a hand that no longer sends lets go
+    pub sent_ns: u64,
+}
+
+/// Views in a frame, in this order.
+pub const VIEWS: [&str; 4] = ["3d", "axial", "coronal", "sagittal"];
+
+/// Where a view's pixels lie in a frame.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.ViewRect/v1")]
+pub struct ViewRect {
+    /// first byte in the payload
+    pub offset: u64,
+    /// pixels a row
+    pub width: u32,
+    /// rows; a view is `width · height · 3` bytes, RGB, top row first
+    pub height: u32,
+}
+
+/// User header of a frame. Writer: rendering. Reader: console.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("maille.FrameHeader/v1")]
+pub struct FrameHeader {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// epoch of the tissue that is shown
+    pub epoch: u64,
+    /// sequence of the view state that is shown
+    pub view_sequence: u64,
+    /// time spent rendering [ns]
+    pub render_ns: u64,
+    /// the views, in the order of [`VIEWS`]; 0 × 0 where the scene has none
+    pub views: [ViewRect; 4],
+}
+
+fn finite(numbers: &[f64]) -> bool {
+    numbers.iter().all(|v| v.is_finite())
+}
+
+impl ToolMove {
+    /// The message, if its numbers can be used.
+    pub fn checked(self) -> Option<Self> {
+        let ok = finite(&self.tip_mm) && finite(&self.outside_mm) && finite(&self.normal) && self.radius_mm.is_finite() && self.radius_mm > 0.0;
+        ok.then_some(self)
+    }
+}
+
+impl ToolCommand {
+    /// The message, if its numbers can be used.
+    pub fn checked(self) -> Option<Self> {
+        (finite(&self.target_mm) && self.taken <= 1).then_some(self)
+    }
+}
+
+impl ViewState {
+    /// The message, if its numbers can be used: finite, a camera that looks somewhere, a rising transfer function.
+    pub fn checked(self) -> Option<Self> {
+        let numbers = [self.threshold_hu, self.fov_deg, self.window_center_hu, self.window_width_hu];
+        let distance = |a: &[f64; 3], b: &[f64; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>().sqrt();
+        let points = self.transfer.get(..usize::try_from(self.transfer_count).ok()?)?;
+        let ok = finite(&numbers)
+            && [self.eye_mm, self.target_mm, self.up, self.sections_mm].iter().all(|v| finite(v))
+            && distance(&self.eye_mm, &self.target_mm) > 1e-6
+            && distance(&self.up, &[0.0; 3]) > 1e-6
+            && (1.0..=170.0).contains(&self.fov_deg)
+            && self.window_width_hu > 0.0
+            && points.iter().all(|p| finite(p) && p[1..].iter().all(|v| (0.0..=1.0).contains(v)))
+            && points.windows(2).all(|p| p[0][0] < p[1][0]);
+        ok.then_some(self)
+    }
+}
+
+impl FrameHeader {
+    /// The header, if every view lies inside a payload of `len` bytes.
+    pub fn checked(self, len: usize) -> Option<Self> {
+        let inside = |v: &ViewRect| u64::from(v.width) * u64::from(v.height) * 3 + v.offset <= len as u64;
+        (self.views.iter().all(|v| v.width < 1 << 15 && v.height < 1 << 15 && v.offset < 1 << 40 && inside(v))).then_some(self)
+    }
+}
