@@ -1,1 +1,37 @@
-//! Placeholder: replaced by the part's first commit.
+//! Ray casting of bricks on the CPU: volume pictures, first-hit isosurfaces, X-ray, and sections.
+//!
+//! The mental model: a [`Camera`] and [`Settings`] say what to show; [`Skip`] knows which cells of the volume hold anything
+//! to be seen under those settings and how far the next such cell is; [`render`] walks one ray a pixel through the bricks
+//! *where they lie* (any [`BrickSource`](maille_volume::BrickSource)) and fills a [`Picture`].
+//!
+//! Units and frames: camera and planes in LPS millimetres; values in HU; opacity α over 1 mm, corrected for the step by
+//! 1 − (1 − α)^step; colours linear in 0…1, written as bytes without gamma (as VTK does, so that pictures compare).
+//!
+//! Conventions: the volume is the box of voxel centres (0 … n−1 on each axis). Samples lie on a grid of each ray's own,
+//! half a step behind its entry into that box, and skipping only ever jumps along this grid: the picture does not depend on
+//! it. Gradients are central differences at the eight voxels around the sample, interpolated (no gradient volume exists).
+//!
+//! Invariants: no clock, no file, no logging; no voxel is copied; nothing is allocated per ray. `unsafe` lives in
+//! [`packet`] alone (CPU features found at run time, loads without bounds checks), each with its reason.
+
+#![deny(unsafe_code)]
+
+pub mod camera;
+mod frame;
+#[cfg(target_arch = "x86_64")]
+mod packet;
+pub mod picture;
+pub mod render;
+mod scalar;
+pub mod section;
+pub mod settings;
+pub mod skip;
+pub mod transfer;
+
+pub use camera::Camera;
+pub use picture::Picture;
+pub use render::{Kernel, RenderError, render, render_with};
+pub use section::{Plane, Section, section};
+pub use settings::{Light, Mode, Settings, Shading, Step};
+pub use skip::{Skip, SkipUpdate};
+pub use transfer::{Preset, Transfer, TransferError};

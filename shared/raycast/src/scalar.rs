@@ -1,0 +1,200 @@
+//! One ray at a time, in plain Rust: the reference of the packet kernel, and what runs where there is no AVX2.
+//!
+//! Volume: C ← C + T·α·c, T ← T·(1 − α), front to back. Isosurface: the first sample at or above the threshold, then
+//! regula falsi between it and the sample before. X-ray: Σ μ·step. Same sample grid, same skipping, same shading as
+//! [`packet`](crate::packet).
+
+use crate::{
+    frame::{Frame, OPAQUE, REFINEMENTS, Ray},
+    settings::Mode,
+    skip::Skip,
+};
+use maille_volume::{
+    BrickSource,
+    brick::{Brick, CELL, EDGE, ROW, SLICE},
+};
+
+/// Colour 0…1 and depth [mm] of one ray, before the background.
+#[derive(Clone, Copy, Debug)]
+pub struct Seen {
+    /// colour, weighted by opacity
+    pub color: [f32; 3],
+    /// light that goes on to the background
+    pub transmittance: f32,
+    /// distance from the eye [mm]
+    pub depth: f32,
+}
+
+/// Casts rays of one frame through one source.
+pub struct Caster<'a, S: BrickSource + ?Sized> {
+    pub frame: &'a Frame,
+    pub source: &'a S,
+    /// none: every sample is looked at
+    pub skip: Option<&'a Skip>,
+}
+
+impl<S: BrickSource + ?Sized> Caster<'_, S> {
+    /// Walks the ray through a pixel.
+    pub fn cast(&self, x: usize, y: usize) -> Seen {
+        let f = self.frame;
+        let ray = f.ray(x, y);
+        let mut seen = Seen { color: [0.0; 3], transmittance: 1.0, depth: f32::INFINITY };
+        let mut attenuation = 0.0;
+        let mut k = 0.0f32;
+        while k < ray.samples {
+            let p = at(&ray, k);
+            if let Some(jump) = self.jump(&ray, p) {
+                k += jump;
+                continue;
+            }
+            let value = self.value(p) * f.value_scale + f.value_offset;
+            match f.mode {
+                Mode::Volume => {
+                    let [r, g, b, alpha] = f.table.entries[(value.max(0.0) as usize).min(f.table.entries.len() - 1)];
+                    if alpha > 0.0 {
+                        let (diffuse, specular) = self.shade(&ray, p, k);
+                        let weight = seen.transmittance * alpha;
+                        for (out, c) in seen.color.iter_mut().zip([r, g, b]) {
+                            *out += weight * (c * diffuse + specular);
+                        }
+                        let left = seen.transmittance - weight;
+                        if seen.transmittance >= 0.5 && left < 0.5 {
+                            seen.depth = ray.start + k * f.step;
+                        }
+                        seen.transmittance = left;
+                        if left < OPAQUE {
+                            let whole = 1.0 / (1.0 - left);
+                            seen.color = seen.color.map(|c| c * whole);
+                            seen.transmittance = 0.0;
+                            break;
+                        }
+                    }
+                }
+                Mode::Isosurface { threshold_hu, color } => {
+                    let threshold = threshold_hu as f32;
+                    if value >= threshold {
+                        let k = if k == 0.0 { k } else { self.refine(&ray, k, value, threshold) };
+                        let (diffuse, specular) = if k == 0.0 { self.cut() } else { self.shade(&ray, at(&ray, k), k) };
+                        return Seen { color: color.map(|c| c * diffuse + specular), transmittance: 0.0, depth: ray.start + k * f.step };
+                    }
+                }
+                Mode::Xray { water_per_mm } => attenuation += water_per_mm as f32 * f.step * (1.0 + value * 1e-3).max(0.0),
+            }
+            k += 1.0;
+        }
+        if matches!(f.mode, Mode::Xray { .. }) {
+            seen.transmittance = (-attenuation).exp();
+            seen.color = [1.0 - seen.transmittance; 3];
+        }
+        seen
+    }
+
+    /// Samples to jump when the cell around p is empty: to the first one outside the empty box around it.
+    #[inline]
+    fn jump(&self, ray: &Ray, p: [f32; 3]) -> Option<f32> {
+        let (distances, counts) = self.skip?.distances();
+        let cell: [usize; 3] = std::array::from_fn(|c| self.cell_of(p, c) / CELL);
+        let d = distances[(cell[2] * counts[1] + cell[1]) * counts[0] + cell[0]];
+        if d == 0 {
+            return None;
+        }
+        let mut jump = f32::INFINITY;
+        for c in 0..3 {
+            let side = if ray.delta[c] > 0.0 { i32::from(d) } else { 1 - i32::from(d) };
+            let wall = (CELL as i32 * (cell[c] as i32 + side)) as f32;
+            jump = jump.min((wall - p[c]) / ray.delta[c]);
+        }
+        // a hair less: a sample on the wall, moved across it by rounding, is looked at
+        Some((jump - 1e-3).ceil().max(1.0))
+    }
+
+    /// Lower corner of the trilinear cell around p, on one axis.
+    #[inline]
+    fn cell_of(&self, p: [f32; 3], c: usize) -> usize {
+        (p[c] as i32).clamp(0, self.frame.last_cell[c]) as usize
+    }
+
+    #[inline]
+    fn locate(&self, p: [f32; 3]) -> (&Brick, usize, [f32; 3]) {
+        let base: [usize; 3] = std::array::from_fn(|c| self.cell_of(p, c));
+        let local = base.map(|b| (b % EDGE) as isize);
+        let brick = self.source.brick(self.source.layout().brick_of(base[0], base[1], base[2]));
+        (brick, Brick::offset(local[0], local[1], local[2]), std::array::from_fn(|c| (p[c] - base[c] as f32).clamp(0.0, 1.0)))
+    }
+
+    /// Trilinear stored value.
+    fn value(&self, p: [f32; 3]) -> f32 {
+        let (brick, o, f) = self.locate(p);
+        let v = |o: usize| f32::from(brick.voxels[o]);
+        let line = |o: usize| lerp(v(o), v(o + 1), f[0]);
+        let plane = |o: usize| lerp(line(o), line(o + ROW), f[1]);
+        lerp(plane(o), plane(o + SLICE), f[2])
+    }
+
+    /// Gradient [stored units/mm], in the grid's axes.
+    pub fn gradient(&self, p: [f32; 3]) -> [f32; 3] {
+        let (brick, o, f) = self.locate(p);
+        let v = |o: usize| f32::from(brick.voxels[o]);
+        let component = |step: usize| {
+            let difference = |o: usize| v(o + step) - v(o - step);
+            let line = |o: usize| lerp(difference(o), difference(o + 1), f[0]);
+            let plane = |o: usize| lerp(line(o), line(o + ROW), f[1]);
+            0.5 * lerp(plane(o), plane(o + SLICE), f[2])
+        };
+        let g = [component(1), component(ROW), component(SLICE)];
+        std::array::from_fn(|c| g[c] * self.frame.per_mm[c])
+    }
+
+    /// Factors of colour and highlight at a sample.
+    fn shade(&self, ray: &Ray, p: [f32; 3], k: f32) -> (f32, f32) {
+        let f = self.frame;
+        let Some(shading) = f.shading else { return (1.0, 0.0) };
+        let g = self.gradient(p);
+        let square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+        let light = if f.at_eye { ray.direction } else { f.light };
+        let dot = (g[0] * light[0] + g[1] * light[1] + g[2] * light[2]).abs();
+        let cosine = if square > ZERO_GRADIENT { (dot / square.sqrt()).min(1.0) } else { 0.0 };
+        let distance = ray.start + k * f.step;
+        let strength = 1.0 / (1.0 + distance * distance * f.falloff);
+        let highlight = if square > ZERO_GRADIENT { shading.specular * cosine.powi(shading.power as i32) } else { 0.0 };
+        ((shading.ambient + shading.diffuse * cosine) * strength, highlight * strength)
+    }
+
+    /// Shading of matter cut open where the ray enters the volume or leaves the eye: as if facing the light.
+    fn cut(&self) -> (f32, f32) {
+        self.frame.shading.map_or((1.0, 0.0), |s| (s.ambient + s.diffuse, 0.0))
+    }
+
+    /// Sample number, fractional, at which the threshold is crossed between k − 1 and k (Illinois regula falsi).
+    fn refine(&self, ray: &Ray, k: f32, value: f32, threshold: f32) -> f32 {
+        let f = self.frame;
+        let miss = |k: f32| self.value(at(ray, k)) * f.value_scale + f.value_offset - threshold;
+        let (mut a, mut b) = (k - 1.0, k);
+        let (mut at_a, mut at_b) = (miss(a).min(-1e-6), value - threshold);
+        for _ in 0..REFINEMENTS {
+            let middle = a + (b - a) * (at_a / (at_a - at_b));
+            let v = miss(middle);
+            if v >= 0.0 {
+                (b, at_b) = (middle, v);
+                at_a *= 0.5;
+            } else {
+                (a, at_a) = (middle, v);
+                at_b *= 0.5;
+            }
+        }
+        b
+    }
+}
+
+/// Squared gradient [(stored units/mm)²] below which there is no direction: far less than one unit of difference.
+pub const ZERO_GRADIENT: f32 = 1e-8;
+
+#[inline]
+fn at(ray: &Ray, k: f32) -> [f32; 3] {
+    std::array::from_fn(|c| ray.delta[c].mul_add(k, ray.origin[c]))
+}
+
+#[inline]
+fn lerp(a: f32, b: f32, t: f32) -> f32 {
+    a + (b - a) * t
+}

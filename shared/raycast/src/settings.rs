@@ -1,0 +1,118 @@
+//! What a picture shows and how finely it is sampled.
+
+use crate::transfer::Transfer;
+use maille_volume::VolumeInfo;
+
+/// How samples become a pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Mode {
+    /// front-to-back composition under the transfer function
+    Volume,
+    /// the first point along the ray that reaches a value, found to a small part of the step
+    Isosurface {
+        /// value of the surface (HU); matter is at and above it
+        threshold_hu: f64,
+        /// its colour
+        color: [f32; 3],
+    },
+    /// Beer–Lambert transmission, dense bright: 1 − exp(−∫ μ ds), μ = μ_water · max(0, 1 + HU/1000)
+    Xray {
+        /// attenuation of water [1/mm]; 0.02 is about that of 70 keV photons, less shows a thick body better
+        water_per_mm: f64,
+    },
+}
+
+/// Where the light is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Light {
+    /// far behind the camera, along its axis: direction and view are one constant vector, as in VTK's mapper
+    Headlight,
+    /// at the eye, as in an endoscope, weaker with distance: 1 / (1 + (d / half_distance)²)
+    AtEye {
+        /// distance at which half the light is left [mm]
+        half_distance_mm: f64,
+    },
+}
+
+/// Phong's model, two-sided: colour · (ambient + diffuse · |n·l|) + specular · |n·h|^power, with h = l for both lights.
+/// Where the gradient vanishes only the ambient part is left.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shading {
+    /// light from everywhere
+    pub ambient: f32,
+    /// share of diffuse reflection
+    pub diffuse: f32,
+    /// share of the highlight
+    pub specular: f32,
+    /// sharpness of the highlight, a whole number
+    pub power: u32,
+    /// the lamp
+    pub light: Light,
+}
+
+impl Default for Shading {
+    fn default() -> Self {
+        Self { ambient: 0.1, diffuse: 0.7, specular: 0.2, power: 10, light: Light::Headlight }
+    }
+}
+
+/// Distance between samples.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Step {
+    /// in millimetres
+    Millimetres(f64),
+    /// in smallest spacings
+    Voxels(f64),
+}
+
+impl Step {
+    /// The step in millimetres for a volume.
+    pub fn millimetres(self, info: &VolumeInfo) -> f64 {
+        match self {
+            Self::Millimetres(mm) => mm,
+            Self::Voxels(n) => n * info.grid.min_spacing(),
+        }
+    }
+}
+
+/// Everything but camera and voxels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// how samples become a pixel
+    pub mode: Mode,
+    /// HU → colour and opacity (volume mode)
+    pub transfer: Transfer,
+    /// the light, or none: colours as the transfer function has them
+    pub shading: Option<Shading>,
+    /// distance between samples
+    pub step: Step,
+    /// colour where nothing is
+    pub background: [f32; 3],
+}
+
+impl Default for Settings {
+    /// A shaded CT, one voxel a step, on black.
+    fn default() -> Self {
+        Self::volume(Transfer::default())
+    }
+}
+
+impl Settings {
+    /// Volume rendering of a transfer function, with its own shading.
+    pub fn volume(transfer: Transfer) -> Self {
+        let shading = Some(transfer.shading.unwrap_or_default());
+        Self { mode: Mode::Volume, transfer, shading, step: Step::Voxels(1.0), background: [0.0; 3] }
+    }
+
+    /// The surface at a value, in the colour of bone.
+    pub fn isosurface(threshold_hu: f64) -> Self {
+        let mode = Mode::Isosurface { threshold_hu, color: [0.93, 0.86, 0.76] };
+        let shading = Some(Shading { ambient: 0.1, diffuse: 0.8, specular: 0.1, ..Shading::default() });
+        Self { mode, shading, ..Self::default() }
+    }
+
+    /// A radiograph.
+    pub fn xray() -> Self {
+        Self { mode: Mode::Xray { water_per_mm: 0.008 }, shading: None, ..Self::default() }
+    }
+}
