@@ -1,0 +1,153 @@
+//! From parts to voxels.
+//!
+//! Work goes block by block (8³ voxels). A part fills a block when its distance at the block's centre is below minus the
+//! block's radius (times the part's Lipschitz constant), and misses it when it is above, or when their boxes are apart. The last
+//! part that fills a block hides all before it; what comes after and neither fills nor misses is evaluated per voxel.
+//!
+//! Invariant: blocks do not depend on threads, and sorting a part out of a block changes no voxel.
+
+use crate::{
+    label::Label,
+    part::{At, Part},
+    texture,
+};
+use maille_volume::Grid;
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Voxels along a block's edge.
+const BLOCK: usize = 8;
+
+/// Width of a soft edge, in voxels: a scanner's point spread is a little wider than its voxel.
+const EDGE_WIDTH: f64 = 1.25;
+
+/// Density and the amplitudes of the two textures, mixed in one go.
+type Tissue = [f32; 3];
+
+fn tissue(label: Label) -> Tissue {
+    let [smooth, noise] = label.texture();
+    [label.hu() as f32, smooth as f32, noise as f32]
+}
+
+/// The parts that matter in a block: the tissue below, and parts by number, in order.
+struct Sorted {
+    base: Label,
+    active: Range<usize>,
+}
+
+/// Sorts the parts for one block; numbers of active parts are appended to `active`.
+fn sort(parts: &[Part], low: Vector3<f64>, high: Vector3<f64>, margin: f64, active: &mut Vec<u16>) -> Sorted {
+    let (center, radius) = (0.5 * (low + high), 0.5 * (high - low).norm());
+    let at = At::new(center);
+    let first = active.len();
+    let mut base = Label::Air;
+    for (n, part) in parts.iter().enumerate().rev() {
+        // within its box a part may reach; a soft edge may stand out by `margin`
+        if (0..3).any(|c| low[c] > part.high[c] + margin || high[c] < part.low[c] - margin) {
+            continue;
+        }
+        let d = (part.distance)(&at);
+        let reach = part.lipschitz * radius + margin;
+        if d > reach {
+            continue;
+        }
+        let boxed_in = (0..3).all(|c| low[c] >= part.low[c] + margin && high[c] <= part.high[c] - margin);
+        if d < -reach && boxed_in {
+            base = part.label;
+            break;
+        }
+        active.push(n as u16);
+    }
+    active[first..].reverse();
+    Sorted { base, active: first..active.len() }
+}
+
+/// Calls `row(slice_in_slab, j, sorted blocks along x, active numbers, out)` for all rows, slab by slab in parallel.
+fn for_rows<T: Send>(
+    parts: &[Part],
+    grid: &Grid,
+    margin: f64,
+    out: &mut [T],
+    row: impl Fn(usize, usize, &[Sorted], &[u16], &mut [T]) + Sync,
+) {
+    assert!(parts.len() < usize::from(u16::MAX), "parts are numbered in 16 bits");
+    let [nx, ny, nz] = grid.size;
+    let (bx, by) = (nx.div_ceil(BLOCK), ny.div_ceil(BLOCK));
+    let center = |c: usize, n: usize| grid.origin[c] + n as f64 * grid.spacing[c];
+    out.par_chunks_mut(nx * ny * BLOCK).enumerate().for_each(|(slab, out)| {
+        let k0 = slab * BLOCK;
+        let mut active = Vec::new();
+        let sorted: Vec<Sorted> = (0..by * bx)
+            .map(|b| {
+                let first = [b % bx * BLOCK, b / bx * BLOCK, k0];
+                let low = Vector3::from_fn(|c, _| center(c, first[c]));
+                let high = Vector3::from_fn(|c, _| center(c, (first[c] + BLOCK).min([nx, ny, nz][c]) - 1));
+                sort(parts, low, high, margin, &mut active)
+            })
+            .collect();
+        for (n, out) in out.chunks_mut(nx).enumerate() {
+            let (k, j) = (k0 + n / ny, n % ny);
+            row(k, j, &sorted[j / BLOCK * bx..][..bx], &active, out);
+        }
+    });
+}
+
+/// Voxels in HU.
+pub(crate) fn densities(parts: &[Part], grid: &Grid, seed: u64) -> Vec<i16> {
+    let width = EDGE_WIDTH * grid.spacing.iter().sum::<f64>() / 3.0;
+    let tissues: Vec<Tissue> = parts.iter().map(|part| tissue(part.label)).collect();
+    let [dx, dy, dz] = grid.spacing;
+    let mut out = vec![0i16; grid.voxel_count()];
+    for_rows(parts, grid, 0.5 * width, &mut out, |k, j, blocks, active, out| {
+        let (y, z) = (grid.origin[1] + j as f64 * dy, grid.origin[2] + k as f64 * dz);
+        let mut smooth = [0f32; BLOCK];
+        for (b, block) in blocks.iter().enumerate() {
+            let out = &mut out[b * BLOCK..((b + 1) * BLOCK).min(grid.size[0])];
+            let x0 = grid.origin[0] + (b * BLOCK) as f64 * dx;
+            let below = tissue(block.base);
+            let textured = block.base != Label::Air || !block.active.is_empty();
+            if textured {
+                texture::smooth_row(seed, x0, dx, y, z, &mut smooth[..out.len()]);
+            }
+            for (n, out) in out.iter_mut().enumerate() {
+                let mut now = below;
+                if !block.active.is_empty() {
+                    let at = At::new(Vector3::new(x0 + n as f64 * dx, y, z));
+                    for &part in &active[block.active.clone()] {
+                        let share = share(&parts[usize::from(part)], &at, width);
+                        let above = &tissues[usize::from(part)];
+                        now = std::array::from_fn(|c| now[c] + share * (above[c] - now[c]));
+                    }
+                }
+                let noise = texture::white(seed, (b * BLOCK + n) as i32, j as i32, k as i32);
+                *out = (now[0] + now[1] * smooth[n] + now[2] * noise).round() as i16;
+            }
+        }
+    });
+    out
+}
+
+/// Share of a voxel that a part covers.
+#[inline]
+fn share(part: &Part, at: &At, width: f64) -> f32 {
+    if !part.in_box(&at.p, 0.5 * width) {
+        return 0.0;
+    }
+    (0.5 - (part.distance)(at) / width).clamp(0.0, 1.0) as f32
+}
+
+/// Label numbers at voxel centres.
+pub(crate) fn labels(parts: &[Part], grid: &Grid) -> Vec<u8> {
+    let mut out = vec![0u8; grid.voxel_count()];
+    for_rows(parts, grid, 0.0, &mut out, |k, j, blocks, active, out| {
+        for (i, out) in out.iter_mut().enumerate() {
+            let block = &blocks[i / BLOCK];
+            let at = At::new(Vector3::from_fn(|c, _| grid.origin[c] + [i, j, k][c] as f64 * grid.spacing[c]));
+            let active = &active[block.active.clone()];
+            let last = active.iter().rev().map(|&n| &parts[usize::from(n)]).find(|part| part.contains(&at));
+            *out = last.map_or(block.base, |part| part.label).number();
+        }
+    });
+    out
+}
