@@ -10,14 +10,25 @@
 
 #![forbid(unsafe_code)]
 
+mod error;
+pub mod limits;
+mod load;
 pub mod path;
+pub mod plan;
+pub mod registry;
+pub mod resolve;
 pub mod scene;
 pub mod sections;
 pub mod suggest;
 pub mod tissue;
 pub mod tool;
 
-pub use path::{BoxMm, ToolPose, Waypoint};
+pub use error::SceneError;
+pub use load::TRANSFER_PRESETS;
+pub use path::{BoxMm, ToolPose, Waypoint, Waypoints};
+pub use plan::{Machine, Plan, ProcessPlan, SegmentPlan, plan};
+pub use registry::{Channel, Effect, Knob, Process};
+pub use resolve::View;
 pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
 pub use sections::{CameraKind, Console, Deformation, Haptic, Memory, Mode, Pins, Push, Rendering};
 pub use tissue::Tissue;

@@ -47,6 +47,8 @@ pub struct Deformation {
     pub pins: Pins,
     /// part of the tip's depth by which the tissue is moved, 0 to 1
     pub push_scale: f64,
+    /// residual |x − X − u(X)| at which the mapper's inversion stops [mm], 0.0001 to 1 (a knob)
+    pub inversion_tolerance_mm: f64,
     /// at most so many commits a second [Hz], 1 to 1000
     pub rate_hz: f64,
     /// threads of the process; by default a share of the machine's cores
@@ -65,6 +67,7 @@ impl Default for Deformation {
             push: Push::Clamp,
             pins: Pins::Enclosing,
             push_scale: 1.0,
+            inversion_tolerance_mm: 0.01,
             rate_hz: 60.0,
             threads: None,
         }
@@ -203,7 +206,7 @@ impl Default for Rendering {
             endoscope_fov_deg: 90.0,
             from: [0.35, -1.0, 0.2],
             look_at: [0.5, 0.5, 0.5],
-            distance: 1.0,
+            distance: 0.75,
             step: 1.0,
             shading: true,
             opacity_end: 0.99,

@@ -132,10 +132,6 @@ pub struct Approach {
     pub from: [f64; 3],
     /// end of the search, likewise
     pub toward: [f64; 3],
-    /// corners on the way there (fractions), for passages that bend: the tool goes along them once, and the search is
-    /// on the last piece only
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub via: Vec<[f64; 3]>,
     /// how deep the tip's front presses in below the surface [mm], 0.1 to 50
     pub press_mm: f64,
     /// how far before the surface the tip's front hovers [mm]
@@ -148,15 +144,7 @@ pub struct Approach {
 
 impl Default for Approach {
     fn default() -> Self {
-        Self {
-            from: [0.5, 0.0, 0.5],
-            toward: [0.5, 1.0, 0.5],
-            via: Vec::new(),
-            press_mm: 6.0,
-            hover_mm: 5.0,
-            period_s: 4.0,
-            lateral_mm: 0.0,
-        }
+        Self { from: [0.5, 0.0, 0.5], toward: [0.5, 1.0, 0.5], press_mm: 6.0, hover_mm: 5.0, period_s: 4.0, lateral_mm: 0.0 }
     }
 }
 

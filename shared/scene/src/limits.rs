@@ -1,0 +1,76 @@
+//! The range of every number in a scene, in one table: what is checked at loading, and what messages and help say.
+
+use crate::scene::Scene;
+
+/// The allowed range of one number of the scene.
+pub struct Limit {
+    /// key in the file, from the root
+    pub path: &'static str,
+    /// unit, empty for a pure number
+    pub unit: &'static str,
+    /// smallest allowed
+    pub low: f64,
+    /// largest allowed
+    pub high: f64,
+    /// the number in a scene; none when the scene leaves it out
+    pub get: fn(&Scene) -> Option<f64>,
+}
+
+macro_rules! limits {
+    ($($section:ident . $field:ident : $low:literal ..= $high:literal [$unit:literal] $get:expr;)*) => {
+        &[$(Limit {
+            path: concat!(stringify!($section), ".", stringify!($field)),
+            unit: $unit,
+            low: $low as f64,
+            high: $high as f64,
+            get: $get,
+        }),*]
+    };
+}
+
+/// Every number outside lists, with its range. (Lists — way points, tissue rows — are checked where they are read.)
+#[rustfmt::skip]
+pub static LIMITS: &[Limit] = limits! {
+    tool.radius_mm: 0.1 ..= 20 ["mm"] |s| s.tool.as_ref().map(|t| t.radius_mm);
+    tool.period_s: 0.1 ..= 3600 ["s"] |s| s.tool.as_ref().and_then(|t| t.period_s);
+    deformation.offset: 0.01 ..= 0.99 [""] |s| Some(s.deformation.offset);
+    deformation.threshold_hu: -1024 ..= 3071 ["HU"] |s| Some(s.deformation.threshold_hu);
+    deformation.bone_hu: -1024 ..= 32767 ["HU"] |s| Some(s.deformation.bone_hu);
+    deformation.movement_limit_mm: 0.1 ..= 100 ["mm"] |s| Some(s.deformation.movement_limit_mm);
+    deformation.push_scale: 0 ..= 1 [""] |s| Some(s.deformation.push_scale);
+    deformation.inversion_tolerance_mm: 0.0001 ..= 1 ["mm"] |s| Some(s.deformation.inversion_tolerance_mm);
+    deformation.rate_hz: 1 ..= 1000 ["Hz"] |s| Some(s.deformation.rate_hz);
+    deformation.threads: 1 ..= 256 [""] |s| s.deformation.threads.map(|n| n as f64);
+    haptic.rate_hz: 100 ..= 4000 ["Hz"] |s| Some(s.haptic.rate_hz);
+    haptic.max_force_n: 0.1 ..= 40 ["N"] |s| Some(s.haptic.max_force_n);
+    haptic.max_slew_n_per_s: 1 ..= 100000 ["N/s"] |s| Some(s.haptic.max_slew_n_per_s);
+    haptic.contact_stiffness_n_per_mm: 0.01 ..= 5 ["N/mm"] |s| Some(s.haptic.contact_stiffness_n_per_mm);
+    haptic.contact_damping_n_s_per_mm: 0 ..= 0.1 ["N·s/mm"] |s| Some(s.haptic.contact_damping_n_s_per_mm);
+    haptic.ramp_s: 0 ..= 10 ["s"] |s| Some(s.haptic.ramp_s);
+    haptic.fade_s: 0 ..= 10 ["s"] |s| Some(s.haptic.fade_s);
+    haptic.move_step_mm: 0 ..= 10 ["mm"] |s| Some(s.haptic.move_step_mm);
+    haptic.state_hz: 1 ..= 1000 ["Hz"] |s| Some(s.haptic.state_hz);
+    haptic.cpu: 0 ..= 1023 [""] |s| s.haptic.cpu.map(|n| n as f64);
+    haptic.priority: 0 ..= 99 [""] |s| Some(s.haptic.priority.into());
+    rendering.rate_hz: 1 ..= 240 ["Hz"] |s| Some(s.rendering.rate_hz);
+    rendering.fov_deg: 1 ..= 170 ["°"] |s| Some(s.rendering.fov_deg);
+    rendering.endoscope_fov_deg: 1 ..= 170 ["°"] |s| Some(s.rendering.endoscope_fov_deg);
+    rendering.distance: 0.05 ..= 10 [""] |s| Some(s.rendering.distance);
+    rendering.step: 0.05 ..= 4 ["voxels"] |s| Some(s.rendering.step);
+    rendering.opacity_end: 0.5 ..= 1 [""] |s| Some(s.rendering.opacity_end);
+    rendering.threads: 1 ..= 256 [""] |s| s.rendering.threads.map(|n| n as f64);
+    console.jpeg_quality: 10 ..= 100 [""] |s| Some(s.console.jpeg_quality.into());
+    memory.spare_mib: 1 ..= 1048576 ["MiB"] |s| s.memory.spare_mib.map(|n| n as f64);
+    memory.spare_slots: 8 ..= 100000000 [""] |s| s.memory.spare_slots.map(|n| n as f64);
+    memory.readers: 1 ..= 64 [""] |s| s.memory.readers.map(|n| n as f64);
+};
+
+/// The limit of a key, if it has one.
+pub fn limit(path: &str) -> Option<&'static Limit> {
+    LIMITS.iter().find(|l| l.path == path)
+}
+
+/// `0.01 to 0.99`, `1 to 1000 Hz`.
+pub fn range_text(low: f64, high: f64, unit: &str) -> String {
+    if unit.is_empty() { format!("{low} to {high}") } else { format!("{low} to {high} {unit}") }
+}

@@ -1,0 +1,394 @@
+//! From a scene file to a [`Scene`]: strict reading, ranges, files, effects; every fault on its line.
+//!
+//! The text is read twice by the same parser: once into the structs (which refuse unknown keys) and once into a tree that knows where
+//! each value stands, so that the structs stay plain data and a fault found later still has its place.
+
+use crate::{
+    error::{Fault, SceneError, Source},
+    limits::{LIMITS, range_text},
+    registry::{self, CalledBy, KNOBS},
+    scene::{EffectSetting, Scene, Size},
+    suggest,
+    tool::{Device, PathPoint},
+};
+use serde::Deserialize;
+use std::{
+    fs,
+    ops::Range,
+    path::{Path, PathBuf},
+};
+use toml::{Spanned, de::DeTable};
+
+/// Transfer functions known by name.
+pub const TRANSFER_PRESETS: &[&str] = &["ct", "bone", "soft", "lung"];
+
+const BUILTIN: &str = include_str!("../../../config/default.toml");
+
+impl Scene {
+    /// Reads a scene file; `file` names in it are looked up beside it, then in the working directory, and must exist.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, SceneError> {
+        Self::open(Some(path.as_ref()), None)
+    }
+
+    /// The scene that `maille run` shows when none is named.
+    pub fn builtin_default() -> Self {
+        Self::parse("default.toml", BUILTIN).expect("the built-in scene is read by a test")
+    }
+
+    /// A scene file, or the built-in scene, with the volume it is to be run on (`--volume`), ready to use: files found,
+    /// way points of `path:FILE` read.
+    pub fn open(path: Option<&Path>, volume: Option<&Path>) -> Result<Self, SceneError> {
+        let (name, text, folder) = match path {
+            None => ("the built-in scene".to_string(), BUILTIN.to_string(), PathBuf::new()),
+            Some(path) => {
+                let text = fs::read_to_string(path).map_err(|e| {
+                    SceneError::sentence(
+                        format!("cannot read the scene {}: {e}", path.display()),
+                        (e.kind() == std::io::ErrorKind::InvalidData)
+                            .then(|| "a scene is a TOML text file; a volume goes with --volume".into()),
+                    )
+                })?;
+                (path.display().to_string(), text, path.parent().unwrap_or(Path::new("")).to_path_buf())
+            }
+        };
+        let (mut scene, document) = read(&name, &text)?;
+        if let Some(volume) = volume {
+            if !volume.exists() {
+                return Err(SceneError::sentence(format!("there is no volume {}", volume.display()), None));
+            }
+            scene.replace_volume(volume.to_path_buf());
+        } else if let Some(file) = &scene.volume.file {
+            scene.volume.file = Some(document.find_file("volume.file", file, &folder, "volume file")?);
+        }
+        let transfer = PathBuf::from(&scene.rendering.transfer);
+        if !TRANSFER_PRESETS.contains(&scene.rendering.transfer.as_str()) {
+            let found = document.find_file("rendering.transfer", &transfer, &folder, "transfer function")?;
+            scene.rendering.transfer = found.display().to_string();
+        }
+        if let Some(Device::PathFile(file)) = scene.tool.as_ref().map(|t| &t.device) {
+            let found = document.find_file("tool.device", file, &folder, "file of way points")?;
+            scene.use_device(Device::PathFile(found))?;
+        }
+        Ok(scene)
+    }
+
+    /// Reads a scene from text, without looking at any file it names; `name` is for messages.
+    pub fn parse(name: &str, text: &str) -> Result<Self, SceneError> {
+        read(name, text).map(|(scene, _)| scene)
+    }
+
+    /// Chooses what moves the tool, as `--device` does; reads the way points of `path:FILE`.
+    pub fn use_device(&mut self, device: Device) -> Result<(), SceneError> {
+        let Some(tool) = &mut self.tool else {
+            return Err(SceneError::sentence("this scene has no [tool] for a device to move", Some("add a [tool] table".into())));
+        };
+        if let Device::PathFile(file) = device {
+            #[derive(Deserialize)]
+            #[serde(deny_unknown_fields)]
+            struct PathFile {
+                path: Vec<PathPoint>,
+                #[serde(rename = "loop", default)]
+                looped: bool,
+                period_s: Option<f64>,
+            }
+            let text = fs::read_to_string(&file)
+                .map_err(|e| SceneError::sentence(format!("cannot read the way points {}: {e}", file.display()), None))?;
+            let document = Document::new(&file.display().to_string(), &text)?;
+            let read: PathFile = document.deserialise()?;
+            let mut faults = Vec::new();
+            check_path(&document, "path", &read.path, &mut faults);
+            document.refuse(faults)?;
+            (tool.path, tool.looped, tool.period_s, tool.device) = (read.path, read.looped, read.period_s, Device::Path);
+        } else {
+            tool.device = device;
+        }
+        Ok(())
+    }
+}
+
+fn read(name: &str, text: &str) -> Result<(Scene, Document), SceneError> {
+    let document = Document::new(name, text)?;
+    let mut scene: Scene = document.deserialise()?;
+    let accuracy = scene.accuracy.index();
+    for knob in KNOBS.iter().filter(|k| document.span(k.name).is_none()) {
+        (knob.set)(&mut scene, knob.defaults[accuracy]);
+    }
+    let mut faults = Vec::new();
+    check_numbers(&document, &scene, &mut faults);
+    check_tool(&document, &scene, &mut faults);
+    check_tissues(&document, &scene, &mut faults);
+    check_effects(&document, &scene, &mut faults);
+    document.refuse(faults)?;
+    Ok((scene, document))
+}
+
+/// A scene's text and where each of its values stands.
+struct Document {
+    source: Source,
+    /// (path, key or value) → bytes, in file order; `tool.path.2.mm` is the third way point's
+    spans: Vec<(String, Range<usize>)>,
+}
+
+impl Document {
+    fn new(name: &str, text: &str) -> Result<Self, SceneError> {
+        let source = Source { name: name.into(), text: text.into() };
+        let tree = DeTable::parse(text).map_err(|e| source.error(vec![of_toml(&e)]))?;
+        let mut spans = Vec::new();
+        collect(&mut spans, "", tree.get_ref());
+        Ok(Self { source, spans })
+    }
+
+    fn deserialise<T: for<'a> Deserialize<'a>>(&self) -> Result<T, SceneError> {
+        toml::from_str(&self.source.text).map_err(|e| self.source.error(vec![of_toml(&e)]))
+    }
+
+    fn span(&self, path: &str) -> Option<Range<usize>> {
+        self.spans.iter().find(|(p, _)| p == path).map(|(_, span)| span.clone())
+    }
+
+    /// A fault at a path, or at the nearest thing above it that stands in the file.
+    fn fault(&self, path: &str, message: impl Into<String>, label: impl Into<String>, help: Option<String>) -> Fault {
+        let mut at = path;
+        let mut span = self.span(at);
+        while let (None, Some((above, _))) = (&span, at.rsplit_once('.')) {
+            at = above;
+            span = self.span(at);
+        }
+        Fault { message: message.into(), span, label: label.into(), help }
+    }
+
+    fn refuse(&self, faults: Vec<Fault>) -> Result<(), SceneError> {
+        if faults.is_empty() { Ok(()) } else { Err(self.source.error(faults)) }
+    }
+
+    fn find_file(&self, key: &str, file: &Path, folder: &Path, what: &str) -> Result<PathBuf, SceneError> {
+        let beside = folder.join(file);
+        if beside.exists() {
+            return Ok(beside);
+        }
+        if file.exists() {
+            return Ok(file.to_path_buf());
+        }
+        let mut help = format!("looked for {}", beside.display());
+        if beside != file {
+            help += &format!(" and {}", file.display());
+        }
+        let neighbours: Vec<String> = fs::read_dir(beside.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))
+            .map(|entries| entries.flatten().filter_map(|e| e.file_name().into_string().ok()).collect())
+            .unwrap_or_default();
+        let mut names: Vec<&str> = neighbours.iter().map(String::as_str).collect();
+        if key == "rendering.transfer" {
+            names.extend(TRANSFER_PRESETS);
+            help += &format!("; presets are {}", TRANSFER_PRESETS.join(", "));
+        }
+        if let Some(near) = file.file_name().and_then(|f| f.to_str()).and_then(|f| suggest::nearest(f, &names)) {
+            help += &format!("; did you mean `{near}`?");
+        }
+        let fault = self.fault(key, format!("there is no {what} {}", file.display()), "no such file", Some(help));
+        Err(self.source.error(vec![fault]))
+    }
+}
+
+fn collect(spans: &mut Vec<(String, Range<usize>)>, above: &str, table: &DeTable<'_>) {
+    for (key, value) in table.iter() {
+        let path = if above.is_empty() { key.get_ref().to_string() } else { format!("{above}.{}", key.get_ref()) };
+        collect_value(spans, path, value);
+    }
+}
+
+fn collect_value(spans: &mut Vec<(String, Range<usize>)>, path: String, value: &Spanned<toml::de::DeValue<'_>>) {
+    spans.push((path.clone(), value.span()));
+    if let Some(table) = value.get_ref().as_table() {
+        collect(spans, &path, table);
+    } else if let Some(array) = value.get_ref().as_array() {
+        for (n, item) in array.iter().enumerate() {
+            collect_value(spans, format!("{path}.{n}"), item);
+        }
+    }
+}
+
+/// The parser's own fault, in our words: an unknown key or word gets a suggestion instead of a list.
+fn of_toml(e: &toml::de::Error) -> Fault {
+    let (message, span) = (e.message(), e.span());
+    let quoted: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+    for (start, what, label) in
+        [("unknown field", "key", "no such key here"), ("unknown variant", "word", "not one of the words allowed here")]
+    {
+        if message.starts_with(start)
+            && let Some((word, candidates)) = quoted.split_first()
+        {
+            let help = format!("allowed here: {}", candidates.join(", "));
+            return Fault { message: suggest::unknown(what, word, candidates), span, label: label.into(), help: Some(help) };
+        }
+    }
+    let message = message.trim().replace('\n', "; ");
+    Fault { label: if message.len() < 60 { message.clone() } else { "here".into() }, message, span, help: None }
+}
+
+/// NaN is in no range.
+fn out_of(value: f64, low: f64, high: f64) -> bool {
+    !(value >= low && value <= high)
+}
+
+fn check_range(document: &Document, path: &str, value: f64, [low, high]: [f64; 2], unit: &str, faults: &mut Vec<Fault>) {
+    if out_of(value, low, high) {
+        let range = range_text(low, high, unit);
+        let key = path.rsplit('.').find(|part| part.parse::<usize>().is_err()).unwrap_or(path);
+        let help = Some(format!("use a number from {range}"));
+        faults.push(document.fault(path, format!("{key} = {value} is out of range"), format!("allowed: {range}"), help));
+    }
+}
+
+fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
+    for limit in LIMITS {
+        if let Some(value) = (limit.get)(scene) {
+            check_range(document, limit.path, value, [limit.low, limit.high], limit.unit, faults);
+        }
+    }
+    let r = &scene.rendering;
+    for (path, size) in [("rendering.size", r.size), ("rendering.section_size", r.section_size)] {
+        size.iter().for_each(|&n| check_range(document, path, n as f64, [16.0, 4096.0], "pixels", faults));
+    }
+    match scene.volume.size {
+        Size::Cube(n) => check_range(document, "volume.size", n as f64, [16.0, 2048.0], "voxels", faults),
+        Size::Box(size) => {
+            (0..3).for_each(|c| check_range(document, &format!("volume.size.{c}"), size[c] as f64, [16.0, 2048.0], "voxels", faults))
+        }
+    }
+    check_range(document, "rendering.section_window_hu.1", r.section_window_hu[1], [1.0, 65536.0], "HU", faults);
+    for (path, v) in [("rendering.eye", r.eye), ("rendering.target", r.target), ("rendering.look_at", Some(r.look_at))] {
+        check_finite(document, path, v, faults);
+    }
+    for (path, v) in [("rendering.up", r.up), ("rendering.from", r.from)] {
+        check_direction(document, path, Some(v), faults);
+    }
+    if scene.deformation.bone_hu <= scene.deformation.threshold_hu {
+        let help = Some("tissue begins at threshold_hu and ends where bone begins: bone_hu must be the larger".into());
+        let message = format!("bone_hu = {} is not above threshold_hu = {}", scene.deformation.bone_hu, scene.deformation.threshold_hu);
+        faults.push(document.fault("deformation.bone_hu", message, "below the threshold", help));
+    }
+    if scene.volume.file.is_some() && scene.volume.phantom.is_some() {
+        let help = Some("keep `file` for a patient of your own, or `phantom` for a made one".into());
+        faults.push(document.fault("volume.phantom", "[volume] names both a file and a phantom", "one of them too many", help));
+    }
+    if scene.memory.spare_mib.is_some() && scene.memory.spare_slots.is_some() {
+        let help = Some("keep one of `spare_mib` and `spare_slots`".into());
+        faults.push(document.fault("memory.spare_slots", "[memory] gives the spare slots twice", "one of them too many", help));
+    }
+}
+
+fn check_finite(document: &Document, path: &str, v: Option<[f64; 3]>, faults: &mut Vec<Fault>) {
+    if v.is_some_and(|v| !v.iter().all(|x| x.is_finite() && x.abs() < 1e6)) {
+        faults.push(document.fault(path, format!("{path} is not a point"), "three finite numbers are wanted", None));
+    }
+}
+
+fn check_direction(document: &Document, path: &str, v: Option<[f64; 3]>, faults: &mut Vec<Fault>) {
+    if v.is_some_and(|v| !v.iter().all(|x| x.is_finite()) || v.iter().map(|x| x * x).sum::<f64>() < 1e-12) {
+        let help = Some("use three finite numbers that are not all zero".into());
+        faults.push(document.fault(path, format!("{path} is no direction"), "zero or not finite", help));
+    }
+}
+
+fn check_tool(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
+    let Some(tool) = &scene.tool else { return };
+    check_path(document, "tool.path", &tool.path, faults);
+    check_range(document, "tool.hand.stiffness_n_per_mm", tool.hand.stiffness_n_per_mm, [0.01, 10.0], "N/mm", faults);
+    check_range(document, "tool.hand.damping_n_s_per_mm", tool.hand.damping_n_s_per_mm, [0.0, 1.0], "N·s/mm", faults);
+    check_range(document, "tool.hand.mass_kg", tool.hand.mass_kg, [0.01, 5.0], "kg", faults);
+    if let Some(a) = &tool.approach {
+        check_range(document, "tool.approach.press_mm", a.press_mm, [0.1, 50.0], "mm", faults);
+        check_range(document, "tool.approach.hover_mm", a.hover_mm, [0.0, 100.0], "mm", faults);
+        check_range(document, "tool.approach.period_s", a.period_s, [0.2, 600.0], "s", faults);
+        check_range(document, "tool.approach.lateral_mm", a.lateral_mm, [0.0, 50.0], "mm", faults);
+        for (name, at) in [("from", &a.from), ("toward", &a.toward)] {
+            (0..3).for_each(|c| check_range(document, &format!("tool.approach.{name}.{c}"), at[c], [-0.5, 1.5], "of the box", faults));
+        }
+        if a.from == a.toward {
+            faults.push(document.fault("tool.approach.toward", "the approach starts where it ends", "the same point as `from`", None));
+        }
+    }
+    if tool.path.is_empty() && tool.approach.is_none() {
+        let help = Some("add [[tool.path]] way points, or a [tool.approach] that finds the surface itself".into());
+        faults.push(document.fault("tool", "[tool] has no way to go", "neither way points nor an approach", help));
+    }
+}
+
+fn check_path(document: &Document, key: &str, path: &[PathPoint], faults: &mut Vec<Fault>) {
+    let mut before = f64::NEG_INFINITY;
+    for (n, point) in path.iter().enumerate() {
+        let at = |field: &str| format!("{key}.{n}.{field}");
+        check_range(document, &at("time_s"), point.time_s, [0.0, 86400.0], "s", faults);
+        if point.time_s <= before {
+            let message = format!("way point {} is at {} s, not after the one before it ({before} s)", n + 1, point.time_s);
+            faults.push(document.fault(&at("time_s"), message, "times must increase", None));
+        }
+        before = point.time_s;
+        if point.mm.is_some() == point.fraction.is_some() {
+            let message = format!("way point {} needs exactly one of `mm` and `fraction`", n + 1);
+            let help = "`mm` is a patient position (LPS), `fraction` a place in the volume's box";
+            faults.push(document.fault(&format!("{key}.{n}"), message, "no place, or two", Some(help.into())));
+        }
+        check_finite(document, &at("mm"), point.mm, faults);
+        if let Some(f) = point.fraction {
+            (0..3).for_each(|c| check_range(document, &format!("{key}.{n}.fraction.{c}"), f[c], [-0.5, 1.5], "of the box", faults));
+        }
+        check_direction(document, &at("direction"), point.direction, faults);
+    }
+}
+
+fn check_tissues(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
+    let mut top = f64::NEG_INFINITY;
+    for (n, row) in scene.tissues.iter().enumerate() {
+        let at = |field: &str| format!("tissue.{n}.{field}");
+        let name = &row.name;
+        if !(row.hu[0] < row.hu[1]) || !row.hu.iter().all(|v| v.is_finite()) {
+            faults.push(document.fault(&at("hu"), format!("tissue `{name}` has no range"), "low must be below high", None));
+        } else if row.hu[0] < top {
+            let message = format!("tissue `{name}` begins at {} HU, inside the row before it (up to {top})", row.hu[0]);
+            faults.push(document.fault(&at("hu"), message, "rows must ascend and not overlap", None));
+        }
+        top = row.hu[1];
+        check_range(document, &at("stiffness_n_per_mm"), row.stiffness_n_per_mm, [0.0, 50.0], "N/mm", faults);
+        check_range(document, &at("stiffening_n_per_mm2"), row.stiffening_n_per_mm2, [0.0, 50.0], "N/mm²", faults);
+        check_range(document, &at("damping_n_s_per_mm"), row.damping_n_s_per_mm, [0.0, 1.0], "N·s/mm", faults);
+        check_range(document, &at("friction_kinetic"), row.friction_kinetic, [0.0, 2.0], "", faults);
+        check_range(document, &at("friction_static"), row.friction_static, [row.friction_kinetic, 2.0], "", faults);
+    }
+}
+
+fn check_effects(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
+    let names: Vec<&str> = registry::EFFECTS.iter().filter(|e| e.called_by == CalledBy::Effects).map(|e| e.name).collect();
+    for (name, setting) in &scene.effects {
+        let path = format!("effects.{name}");
+        let Some(effect) = registry::EFFECTS.iter().find(|e| e.name == *name && e.called_by == CalledBy::Effects) else {
+            let help = Some(format!("effects are {}", names.join(", ")));
+            faults.push(document.fault(&path, suggest::unknown("effect", name, &names), "no such effect", help));
+            continue;
+        };
+        if let EffectSetting::Settings(table) = setting {
+            let allowed: Vec<&str> = ["enabled"].iter().chain(effect.settings).copied().collect();
+            for key in table.keys().filter(|k| !allowed.contains(&k.as_str())) {
+                faults.push(document.fault(&format!("{path}.{key}"), suggest::unknown("key", key, &allowed), "no such key here", None));
+            }
+            if table.get("enabled").is_some_and(|v| v.as_bool().is_none()) {
+                faults.push(document.fault(&format!("{path}.enabled"), "`enabled` is true or false", "neither", None));
+            }
+        }
+        if !setting.is_on() {
+            continue;
+        }
+        if !effect.available {
+            let help = Some("take it out of the scene, or set it to false".into());
+            let message = format!("the effect `{name}` ({}) is declared for later and not built yet", effect.summary);
+            faults.push(document.fault(&path, message, "not built yet", help));
+        }
+        for needed in effect.depends_on.iter().filter(|n| !scene.has_effect(n)) {
+            let help = match registry::effect(needed).map(|e| e.called_by) {
+                Some(CalledBy::Section(section)) => format!("add a [{section}] table, or set `{name} = false`"),
+                _ => format!("set `{needed} = true`, or `{name} = false`"),
+            };
+            faults.push(document.fault(&path, format!("the effect `{name}` needs `{needed}`"), "cannot stand alone", Some(help)));
+        }
+    }
+}

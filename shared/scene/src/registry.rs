@@ -1,0 +1,330 @@
+//! The registry: every effect a scene can call for and every knob it can turn, each with what it needs and costs.
+//!
+//! A part that adds an effect or a knob adds an entry here and nothing else; the plan derives from these tables alone
+//! ([`crate::plan`]), so that what no entry asks for is not there at run time. Entries with `available: false` are
+//! declared for a later part: a scene that asks for one is refused with a sentence saying so.
+
+use crate::scene::Scene;
+use maille_volume::brick::{Brick, EDGE};
+
+/// A process that a plan may start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Process {
+    /// the 1 kHz loop: device, contact, forces
+    Haptic,
+    /// ChainMail, mapper, commits
+    Deformation,
+    /// ray caster and sections
+    Rendering,
+    /// the page
+    Console,
+}
+
+impl Process {
+    /// Name in `ps`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Haptic => "maille-haptic",
+            Self::Deformation => "maille-deformation",
+            Self::Rendering => "maille-rendering",
+            Self::Console => "maille-console",
+        }
+    }
+
+    /// Name of the service on the command line and in reports.
+    pub fn service(self) -> &'static str {
+        &self.name()["maille-".len()..]
+    }
+}
+
+/// A part of the store: one segment, so many bytes a brick.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Channel {
+    /// name of the segment
+    pub name: &'static str,
+    /// what lies there, with its unit
+    pub meaning: &'static str,
+    /// bytes of one brick
+    pub brick_bytes: usize,
+}
+
+/// Voxels with apron and skip cells.
+pub static VOXELS: Channel = Channel { name: "voxels", meaning: "CT values with apron and skip cells", brick_bytes: size_of::<Brick>() };
+/// Displacement of the elements.
+pub static DISPLACEMENT: Channel = Channel {
+    name: "displacement",
+    meaning: "displacement of each voxel's element [mm], 3 × f32",
+    brick_bytes: 3 * 4 * EDGE * EDGE * EDGE,
+};
+
+/// A piece of work that runs in a process, by construction of that process's pipeline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stage {
+    /// where it runs
+    pub process: Process,
+    /// name, also in timings
+    pub name: &'static str,
+    /// how often it runs
+    pub per: Per,
+}
+
+/// How often a stage runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Per {
+    /// each tick of the haptic loop
+    Tick,
+    /// each step of the deformation
+    Step,
+    /// each frame
+    Frame,
+}
+
+impl Per {
+    /// The word for tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tick => "tick",
+            Self::Step => "step",
+            Self::Frame => "frame",
+        }
+    }
+}
+
+/// What in a scene calls for an effect.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CalledBy {
+    /// every scene has it
+    Always,
+    /// a table of the scene, by name
+    Section(&'static str),
+    /// its name in `[effects]`
+    Effects,
+}
+
+/// Something a scene can call for.
+pub struct Effect {
+    /// name in `[effects]`
+    pub name: &'static str,
+    /// one line for a stranger
+    pub summary: &'static str,
+    /// what in a scene calls for it
+    pub called_by: CalledBy,
+    /// processes that must run
+    pub processes: &'static [Process],
+    /// store channels that must exist
+    pub channels: &'static [&'static Channel],
+    /// work that it adds
+    pub stages: &'static [Stage],
+    /// panels it adds to the page
+    pub panels: &'static [&'static str],
+    /// effects without which it makes no sense
+    pub depends_on: &'static [&'static str],
+    /// keys allowed in its own table under `[effects]`, beside `enabled`
+    pub settings: &'static [&'static str],
+    /// inputs on which it must stay finite and bounded, each a named test
+    pub hard_cases: &'static [&'static str],
+    /// whether it can be switched while the scene runs
+    pub live: bool,
+    /// false: declared for later
+    pub available: bool,
+}
+
+impl Effect {
+    /// An entry with nothing but a name: the base for `..`.
+    const fn named(name: &'static str, summary: &'static str) -> Self {
+        Self {
+            name,
+            summary,
+            called_by: CalledBy::Effects,
+            processes: &[],
+            channels: &[],
+            stages: &[],
+            panels: &[],
+            depends_on: &[],
+            settings: &[],
+            hard_cases: &[],
+            live: false,
+            available: true,
+        }
+    }
+
+    /// An entry declared for later.
+    const fn later(name: &'static str, summary: &'static str, depends_on: &'static [&'static str]) -> Self {
+        Self { depends_on, available: false, ..Self::named(name, summary) }
+    }
+}
+
+const fn stage(process: Process, name: &'static str, per: Per) -> Stage {
+    Stage { process, name, per }
+}
+
+/// All effects.
+pub static EFFECTS: &[Effect] = &[
+    Effect {
+        called_by: CalledBy::Always,
+        processes: &[Process::Rendering],
+        channels: &[&VOXELS],
+        stages: &[stage(Process::Rendering, "ray casting", Per::Frame)],
+        panels: &["3d"],
+        hard_cases: &["camera in tissue", "spacing 10:1", "zero gradient", "opaque and empty transfer functions"],
+        ..Effect::named("view", "the 3D view of the volume")
+    },
+    Effect {
+        called_by: CalledBy::Section("tool"),
+        processes: &[Process::Haptic],
+        stages: &[
+            stage(Process::Haptic, "device", Per::Tick),
+            stage(Process::Haptic, "contact", Per::Tick),
+            stage(Process::Haptic, "force limits", Per::Tick),
+        ],
+        panels: &["force"],
+        hard_cases: &["stiffness up to the passivity bound", "frozen deformation", "thin and noisy surfaces", "leaving the volume"],
+        ..Effect::named("contact", "a tool that feels the surface, at 1 kHz")
+    },
+    Effect {
+        processes: &[Process::Deformation],
+        channels: &[&DISPLACEMENT],
+        stages: &[
+            stage(Process::Haptic, "tool moves", Per::Tick),
+            stage(Process::Deformation, "chainmail", Per::Step),
+            stage(Process::Deformation, "mapper", Per::Step),
+            stage(Process::Deformation, "commit", Per::Step),
+        ],
+        panels: &["threshold"],
+        depends_on: &["contact"],
+        hard_cases: &[
+            "stiff beside soft",
+            "bone inside",
+            "spacing 1:10",
+            "offset 0.01 to 0.99",
+            "at the border",
+            "zero-length, huge, NaN and infinite moves",
+            "all bone",
+        ],
+        ..Effect::named("deformation", "soft tissue gives way to the tool (ChainMail), and its voxels are rewritten")
+    },
+    Effect {
+        processes: &[Process::Rendering],
+        stages: &[stage(Process::Rendering, "sections", Per::Frame)],
+        panels: &["axial", "coronal", "sagittal"],
+        live: true,
+        ..Effect::named("sections", "axial, coronal and sagittal sections")
+    },
+    Effect::later("relaxation", "tissue creeps back towards rest in idle time", &["deformation"]),
+    Effect::later("object-shape", "separate pieces collide instead of being linked", &["deformation"]),
+    Effect::later("cutting", "links are removed by a blade", &["deformation"]),
+    Effect::later("palpation", "several proxies feel a finger's area", &["contact"]),
+    Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
+    Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
+    Effect::later("breathing", "the patient breathes", &[]),
+    Effect::later("x-ray", "a fluoroscopic view", &[]),
+    Effect::later("ultrasound", "an ultrasound view", &[]),
+    Effect::later("surfaces", "meshes extracted live", &[]),
+    Effect::later("labels", "organs by label", &[]),
+    Effect::later("recording", "a record that can be replayed", &[]),
+];
+
+/// The effect of a name.
+pub fn effect(name: &str) -> Option<&'static Effect> {
+    EFFECTS.iter().find(|e| e.name == name)
+}
+
+/// Something that trades accuracy for time.
+pub struct Knob {
+    /// key in the scene file; its range is the key's in [`crate::limits::LIMITS`]
+    pub name: &'static str,
+    /// effect it belongs to
+    pub effect: &'static str,
+    /// one line for a stranger
+    pub summary: &'static str,
+    /// value at `draft`, `balanced`, `reference`
+    pub defaults: [f64; 3],
+    /// what goes wrong, in a physical unit
+    pub error: &'static str,
+    /// against what that is measured
+    pub truth: &'static str,
+    /// what a finer setting costs
+    pub cost: &'static str,
+    /// reads it in a scene
+    pub get: fn(&Scene) -> f64,
+    /// writes it in a scene
+    pub set: fn(&mut Scene, f64),
+}
+
+/// All knobs.
+pub static KNOBS: &[Knob] = &[
+    Knob {
+        name: "rendering.step",
+        effect: "view",
+        summary: "distance of samples along a ray, in units of the smallest spacing",
+        defaults: [2.0, 1.0, 0.5],
+        error: "difference of the picture [part of full scale]",
+        truth: "the same picture at step 0.1",
+        cost: "frame time grows as 1/step",
+        get: |s| s.rendering.step,
+        set: |s, v| s.rendering.step = v,
+    },
+    Knob {
+        name: "rendering.opacity_end",
+        effect: "view",
+        summary: "a ray ends when this part of the light is used up",
+        defaults: [0.95, 0.99, 0.999],
+        error: "light left out, at most 1 − this [part of full scale]",
+        truth: "the same picture without an early end",
+        cost: "frame time, by the samples behind the surface",
+        get: |s| s.rendering.opacity_end,
+        set: |s, v| s.rendering.opacity_end = v,
+    },
+    Knob {
+        name: "deformation.inversion_tolerance_mm",
+        effect: "deformation",
+        summary: "residual at which the mapper's inversion stops",
+        defaults: [0.05, 0.01, 0.001],
+        error: "residual |x − X − u(X)| [mm]",
+        truth: "fields with a known inverse",
+        cost: "step time, by the number of iterations a voxel",
+        get: |s| s.deformation.inversion_tolerance_mm,
+        set: |s, v| s.deformation.inversion_tolerance_mm = v,
+    },
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::limits::limit;
+
+    #[test]
+    fn every_knob_has_a_range_that_holds_its_defaults_and_reads_what_it_writes() {
+        for knob in KNOBS {
+            let limit = limit(knob.name).unwrap_or_else(|| panic!("{} has no range", knob.name));
+            assert!(effect(knob.effect).is_some_and(|e| e.available), "{} belongs to no effect", knob.name);
+            for value in knob.defaults {
+                assert!((limit.low..=limit.high).contains(&value), "{} = {value}", knob.name);
+                let mut scene = Scene::default();
+                (knob.set)(&mut scene, value);
+                assert_eq!((knob.get)(&scene), value);
+                assert_eq!((limit.get)(&scene), Some(value), "{} and its range read one field", knob.name);
+            }
+            assert_eq!((knob.get)(&Scene::default()), knob.defaults[1], "{}: a scene starts balanced", knob.name);
+        }
+    }
+
+    #[test]
+    fn effects_depend_on_effects_that_exist_and_names_are_unique() {
+        for (n, e) in EFFECTS.iter().enumerate() {
+            assert!(EFFECTS[..n].iter().all(|other| other.name != e.name), "{} stands twice", e.name);
+            for name in e.depends_on {
+                assert!(effect(name).is_some(), "{} depends on {name}", e.name);
+            }
+            // a stage without its process would never run
+            for s in e.stages.iter().filter(|s| !e.processes.contains(&s.process)) {
+                assert!(
+                    e.depends_on.iter().any(|d| effect(d).is_some_and(|d| d.processes.contains(&s.process))),
+                    "{}: stage {} has no process",
+                    e.name,
+                    s.name
+                );
+            }
+        }
+    }
+}
