@@ -9,7 +9,7 @@ use iceoryx2::prelude::ZeroCopySend;
 
 /// Who sent a message, when, and which one it is.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
 #[type_name("maille.Stamp/v1")]
 pub struct Stamp {
     /// simulation time [ns] at which the content held
@@ -150,7 +150,7 @@ pub const VIEWS: [&str; 4] = ["3d", "axial", "coronal", "sagittal"];
 
 /// Where a view's pixels lie in a frame.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
 #[type_name("maille.ViewRect/v1")]
 pub struct ViewRect {
     /// first byte in the payload
@@ -163,7 +163,7 @@ pub struct ViewRect {
 
 /// User header of a frame. Writer: rendering. Reader: console.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
 #[type_name("maille.FrameHeader/v1")]
 pub struct FrameHeader {
     /// sender's stamp

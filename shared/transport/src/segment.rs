@@ -1,0 +1,207 @@
+//! Named shared memory that survives any process: iceoryx2's POSIX shared memory, with the space really reserved.
+//!
+//! Created by the supervisor with mode 0600 and `fallocate`, so that a full /dev/shm is an error at the start and not a
+//! SIGBUS later; opened by everybody else, read-only but where they write. New pages of tmpfs read as zero.
+
+use crate::{Domain, TransportError};
+use iceoryx2::prelude::SemanticString;
+use iceoryx2_bb_posix::shared_memory::{AccessMode, CreationMode, Permission, SharedMemory, SharedMemoryBuilder};
+use iceoryx2_bb_system_types::file_name::FileName;
+use maille_contract::{ControlBlock, control::CONTROL_MAGIC, names::segment};
+use std::{fs::OpenOptions, ops::Deref, path::Path, ptr::NonNull, sync::atomic::Ordering::{Acquire, Relaxed, Release}};
+
+/// How a segment is mapped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Access {
+    /// readers: a store through such a mapping is a fault of the process that tries it
+    Read,
+    /// the one writer of a segment, and all users of the control block
+    ReadWrite,
+}
+
+/// A mapped segment. It stays mapped until it is dropped; dropping it removes nothing.
+#[derive(Debug)]
+pub struct Segment {
+    memory: SharedMemory,
+    access: Access,
+}
+
+// SAFETY: a `Segment` gives out only the address and length of a mapping that does not move or end while it lives; what is
+// read and written through them is the business of the unsafe code that does it.
+#[allow(unsafe_code)]
+unsafe impl Send for Segment {}
+// SAFETY: as above; no method changes anything.
+#[allow(unsafe_code)]
+unsafe impl Sync for Segment {}
+
+impl Segment {
+    /// Makes a segment of `bytes` zero bytes. Supervisor only.
+    ///
+    /// # Errors
+    /// When it exists already, or /dev/shm has not the room: then the error says how much is missing.
+    pub fn create(domain: &Domain, segment: &str, bytes: usize) -> Result<Self, TransportError> {
+        let name = file_name(domain, segment)?;
+        let fail = |reason: String| TransportError::Segment { segment: segment.into(), action: "created", reason };
+        let memory = SharedMemoryBuilder::new(&name)
+            .creation_mode(CreationMode::CreateExclusive)
+            .permission(Permission::OWNER_READ_WRITE)
+            .zero_memory(false)
+            .has_ownership(false)
+            .size(bytes)
+            .create()
+            .map_err(|e| fail(format!("{e:?}")))?;
+        let path = Path::new("/dev/shm").join(domain.segment_name(segment));
+        let file = OpenOptions::new().write(true).open(&path).map_err(|source| TransportError::File { path: path.clone(), source })?;
+        rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, bytes as u64).map_err(|e| {
+            let _ = std::fs::remove_file(&path);
+            if e == rustix::io::Errno::NOSPC {
+                TransportError::Full { segment: segment.into(), needed_mib: (bytes as u64).div_ceil(1 << 20), free_mib: free_shm_bytes() >> 20 }
+            } else {
+                fail(e.to_string())
+            }
+        })?;
+        Ok(Self { memory, access: Access::ReadWrite })
+    }
+
+    /// Maps a segment that the supervisor made.
+    ///
+    /// # Errors
+    /// When it does not exist or may not be mapped.
+    pub fn open(domain: &Domain, segment: &str, access: Access) -> Result<Self, TransportError> {
+        let mode = match access {
+            Access::Read => AccessMode::Read,
+            Access::ReadWrite => AccessMode::ReadWrite,
+        };
+        let memory = SharedMemoryBuilder::new(&file_name(domain, segment)?)
+            .open_existing(mode)
+            .map_err(|e| TransportError::Segment { segment: segment.into(), action: "opened", reason: format!("{e:?}") })?;
+        Ok(Self { memory, access })
+    }
+
+    /// Bytes.
+    pub fn len(&self) -> usize {
+        self.memory.size()
+    }
+
+    /// Whether it has no bytes; it never has none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Address of the first byte, at least page-aligned.
+    pub fn base(&self) -> NonNull<u8> {
+        self.memory.base_address()
+    }
+
+    /// How it is mapped.
+    pub fn access(&self) -> Access {
+        self.access
+    }
+
+    /// Maps every page now: a page fault in a tick costs more than all its work.
+    #[allow(unsafe_code)]
+    pub fn prefault(&self) {
+        let advice = rustix::mm::Advice::LinuxPopulateRead;
+        // SAFETY: address and length are those of a live mapping of ours; populating it changes no byte.
+        let done = unsafe { rustix::mm::madvise(self.base().as_ptr().cast(), self.len(), advice) };
+        // before Linux 5.14 there is no such advice; then pages come as they are touched
+        let _ = done;
+    }
+}
+
+fn file_name(domain: &Domain, segment: &str) -> Result<FileName, TransportError> {
+    let name = domain.segment_name(segment);
+    FileName::new(name.as_bytes()).map_err(|e| TransportError::Segment { segment: segment.into(), action: "named", reason: format!("{e:?}") })
+}
+
+/// Free bytes in /dev/shm.
+pub fn free_shm_bytes() -> u64 {
+    rustix::fs::statvfs("/dev/shm").map_or(0, |s| s.f_bavail * s.f_frsize)
+}
+
+/// The control block of a domain, mapped read-write.
+#[derive(Debug)]
+pub struct ControlMap {
+    segment: Segment,
+}
+
+impl ControlMap {
+    /// Makes the control block. Supervisor only.
+    ///
+    /// # Errors
+    /// As [`Segment::create`].
+    pub fn create(domain: &Domain) -> Result<Self, TransportError> {
+        let map = Self { segment: Segment::create(domain, segment::CONTROL, size_of::<ControlBlock>())? };
+        map.segment.prefault();
+        map.size_bytes.store(size_of::<ControlBlock>() as u64, Relaxed);
+        map.spare_slots_low.store(u64::MAX, Relaxed);
+        map.supervisor_heartbeat_ns.store(crate::monotonic_ns(), Relaxed);
+        map.magic.store(CONTROL_MAGIC, Release);
+        Ok(map)
+    }
+
+    /// Maps the control block that the supervisor made.
+    ///
+    /// # Errors
+    /// When there is none, or it is of another version.
+    pub fn open(domain: &Domain) -> Result<Self, TransportError> {
+        let segment = Segment::open(domain, segment::CONTROL, Access::ReadWrite)?;
+        let fail = |reason| Err(TransportError::Layout { segment: segment::CONTROL.into(), reason });
+        if segment.len() < size_of::<ControlBlock>() {
+            return fail(format!("{} bytes instead of {}", segment.len(), size_of::<ControlBlock>()));
+        }
+        let map = Self { segment };
+        if map.magic.load(Acquire) != CONTROL_MAGIC || map.size_bytes.load(Relaxed) != size_of::<ControlBlock>() as u64 {
+            return fail("another magic number or size".into());
+        }
+        map.segment.prefault();
+        Ok(map)
+    }
+}
+
+impl Deref for ControlMap {
+    type Target = ControlBlock;
+
+    #[allow(unsafe_code)]
+    fn deref(&self) -> &ControlBlock {
+        // SAFETY: the mapping is page-aligned, at least as long as a `ControlBlock` (checked when opened), read-write and
+        // lives as long as `self`; a `ControlBlock` is `repr(C)` and made of atomics only, so that every bit pattern is
+        // a value and concurrent writes by other processes are allowed.
+        unsafe { self.segment.base().cast::<ControlBlock>().as_ref() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maille_contract::{Role, RunState, ServiceState};
+
+    #[test]
+    fn two_maps_of_a_control_block_are_one() {
+        let domain = Domain::fresh().unwrap();
+        let a = ControlMap::create(&domain).unwrap();
+        let b = ControlMap::open(&domain).unwrap();
+        a.set_run_state(RunState::Running);
+        b.service(Role::Haptic).set_state(ServiceState::Ready);
+        assert_eq!((b.run_state(), a.service(Role::Haptic).state()), (RunState::Running, ServiceState::Ready));
+        domain.remove().unwrap();
+    }
+
+    #[test]
+    fn a_segment_larger_than_shm_is_refused_with_a_sentence_and_leaves_nothing() {
+        let domain = Domain::fresh().unwrap();
+        let error = Segment::create(&domain, "huge", 1 << 46).unwrap_err().to_string();
+        assert!(error.contains("not enough room") || error.contains("could not be created"), "{error}");
+        assert!(!Path::new("/dev/shm").join(domain.segment_name("huge")).exists());
+        domain.remove().unwrap();
+    }
+
+    #[test]
+    fn a_block_of_another_version_is_refused() {
+        let domain = Domain::fresh().unwrap();
+        let a = ControlMap::create(&domain).unwrap();
+        a.magic.store(7, Relaxed);
+        assert!(matches!(ControlMap::open(&domain), Err(TransportError::Layout { .. })));
+        domain.remove().unwrap();
+    }
+}
