@@ -1,1 +1,47 @@
-//! Placeholder: replaced by the part's first commit.
+//! Touch: contact of a tool's tip with the isosurface of a volume, and the force it gives to a hand.
+//!
+//! ```text
+//! device ──pose──▶ proxy ──depth, normal──▶ tissue law + friction ──▶ blend ──▶ passivity ──▶ shaper ──force──▶ device
+//!                   │ on the surface that the threshold defines                                (limits, fades)
+//!                   └──▶ tool moves, when the tip presses in
+//! ```
+//!
+//! [`HapticCore::tick`] is the whole chain. Its parts can be used alone: [`surface`] (what is touched), [`proxy`] (where
+//! the tip is held), [`material`] (stiffness of tissue), [`friction`], [`coupling`] (the bound on what a device can render
+//! stably), [`passivity`], [`shaper`] (limits and fades) and [`device`] (scripted, simulated and page-driven devices).
+//!
+//! Units: mm, N, N/mm, N·s/mm, s, values HU; time comes in as nanoseconds. Frame: the patient's (world) frame at rest.
+//!
+//! Invariants: nothing here reads a clock, locks, prints or does I/O; a tick allocates nothing and its work is bounded
+//! ([`limits`]); every force that leaves is finite and within [`Limits`], whatever comes in.
+
+#![forbid(unsafe_code)]
+
+pub mod coupling;
+pub mod device;
+pub mod friction;
+pub mod limits;
+pub mod material;
+pub mod passivity;
+pub mod proxy;
+pub mod shaper;
+pub mod surface;
+mod tick;
+mod toolmove;
+
+pub use coupling::{Coupling, CouplingError};
+pub use device::{ConsoleDevice, Device, DevicePose, Easing, Grip, Path, PathDevice, PathError, SimulatedHand, WayPoint};
+pub use material::{Material, TissueTable};
+pub use proxy::{Contact, Proxy, Touch};
+pub use shaper::{ForceShaper, Limits};
+pub use surface::{AnalyticSurface, Isosurface, Surface};
+pub use tick::{Faults, HapticConfig, HapticCore, TickInputs, TickOutputs};
+pub use toolmove::ToolMove;
+
+/// Position, direction or force inside kernels.
+pub(crate) type V3 = nalgebra::Vector3<f64>;
+
+/// The vector if all its components are finite.
+pub(crate) fn finite(v: [f64; 3]) -> Option<V3> {
+    v.iter().all(|c| c.is_finite()).then(|| V3::from(v))
+}

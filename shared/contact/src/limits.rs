@@ -1,0 +1,19 @@
+//! Bounds of the work in a tick, each with its reason.
+
+/// Steps of the foot point towards the tip. Warm-started, two or three suffice; a step is at most a voxel, so that a tip
+/// moving at 1 m/s is still followed within a tick.
+pub const MAX_RELAX_STEPS: usize = 12;
+/// Half-voxel steps of the search for the surface along a normal: a commit may move the surface by this much.
+pub const MAX_SEARCH_STEPS: usize = 24;
+/// Steps of the search from a point inside the tissue back to the last point outside (thesis fig. 3.17).
+pub const MAX_BACK_STEPS: usize = 64;
+/// Halvings and secants after a search has found the two sides of the surface.
+pub const MAX_ROOT_STEPS: usize = 24;
+/// Materials of a tissue table.
+pub const MAX_MATERIALS: usize = 16;
+/// A move of the device by more than this in one tick is a jump [mm]: 10 m/s at 1 kHz, beyond any hand.
+pub const MAX_JUMP_MM: f64 = 10.0;
+/// Longest time step that is believed [s]; after a longer pause the state moves on by this much.
+pub const MAX_STEP_S: f64 = 0.02;
+/// Position of the foot point [mm]: far below what a device resolves, far above f64 noise.
+pub const FOOT_TOLERANCE_MM: f64 = 1e-5;
