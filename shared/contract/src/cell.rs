@@ -8,7 +8,11 @@
 //! Cost: WORDS relaxed loads or stores. Readers try a bounded number of times.
 
 use bytemuck::{Pod, Zeroable};
-use core::sync::atomic::{AtomicU64, Ordering::{Acquire, Relaxed, Release}, fence};
+use core::sync::atomic::{
+    AtomicU64,
+    Ordering::{Acquire, Relaxed, Release},
+    fence,
+};
 
 /// Tries before a reader gives up; a writer would have to finish two writes within each of them.
 const MAX_TRIES: usize = 64;

@@ -3,9 +3,18 @@
 //! Atomics only. The supervisor creates it before any service starts and keeps it to the end; a service's death leaves
 //! its numbers standing, so that the report counts across restarts.
 
-use crate::{cell::LatestCell, clock::SimulationClock, histogram::SharedHistogram, messages::{ToolCommand, ToolState, ViewState}, names::PINS_PER_ROLE};
+use crate::{
+    cell::LatestCell,
+    clock::SimulationClock,
+    histogram::SharedHistogram,
+    messages::{ToolCommand, ToolState, ViewState},
+    names::PINS_PER_ROLE,
+};
 use bytemuck::Zeroable;
-use core::sync::atomic::{AtomicU64, Ordering::{Acquire, Relaxed, Release}};
+use core::sync::atomic::{
+    AtomicU64,
+    Ordering::{Acquire, Relaxed, Release},
+};
 
 /// "maille" and the version of this layout.
 pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille01");
@@ -217,6 +226,7 @@ impl ControlBlock {
 
     /// Whether a service should end: the run stops, or the supervisor no longer beats.
     pub fn should_end(&self, monotonic_ns: u64) -> bool {
-        self.run_state() == RunState::Stopping || monotonic_ns.saturating_sub(self.supervisor_heartbeat_ns.load(Relaxed)) > 10 * SUPERVISOR_BEAT_NS
+        self.run_state() == RunState::Stopping
+            || monotonic_ns.saturating_sub(self.supervisor_heartbeat_ns.load(Relaxed)) > 10 * SUPERVISOR_BEAT_NS
     }
 }

@@ -185,7 +185,8 @@ fn finite(numbers: &[f64]) -> bool {
 impl ToolMove {
     /// The message, if its numbers can be used.
     pub fn checked(self) -> Option<Self> {
-        let ok = finite(&self.tip_mm) && finite(&self.outside_mm) && finite(&self.normal) && self.radius_mm.is_finite() && self.radius_mm > 0.0;
+        let ok =
+            finite(&self.tip_mm) && finite(&self.outside_mm) && finite(&self.normal) && self.radius_mm.is_finite() && self.radius_mm > 0.0;
         ok.then_some(self)
     }
 }

@@ -1,1 +1,56 @@
-//! Placeholder: replaced by the part's first commit.
+//! The brick store: one writer, many readers, one consistent state for each, through any crash.
+//!
+//! The mental model: a **commit** never changes a brick that anybody can see. It fills free slots with new versions, copies
+//! the few index pages that point to them (copy-on-write pages under one root), and makes it all visible by storing one
+//! word, the **head** = (epoch, root page). A reader **pins** the head word and from then on follows its root: everything
+//! reachable from it stays as it is until the pin is gone. A slot or page lives for the epochs [born, superseded) and is used
+//! again only when no pin lies between.
+//!
+//! - `writer.begin()` → [`Transaction`]; `brick_mut(id)` is a private new version that starts as the current one;
+//!   `commit()` publishes all at once; a dropped transaction leaves no trace.
+//! - `reader.snapshot()` is wait-free: a handful of steps, whatever the writer does. `snapshot.brick(id)` is a reference into
+//!   shared memory, never a copy.
+//! - No free slot (a slow or stopped reader)? The commit is put off and merged into the next one; the writer goes on.
+//! - The committed store is the recovery: [`Writer::open`] finds exactly the last commit, whatever its predecessor was doing.
+//!
+//! # The protocol's one race, and why it is none
+//! A reader stores PENDING in its pin, loads the head, stores what it loaded. The writer stores the head, then reads the
+//! pins. Both sides use sequentially consistent operations, so either the writer sees PENDING (and reclaims nothing), or
+//! the reader's load comes after the writer's store and so pins an epoch that the writer has taken into account.
+//!
+//! # Layout
+//! Five segments (DESIGN D12): the index, rest bricks, brick versions, displacement, state. The first index points at the rest
+//! bricks; what never changes exists once. Units and frame are those of `maille-volume`.
+//!
+//! Not here: who may start when (the supervisor), what a brick means (the mapper, the ray caster).
+
+#![deny(unsafe_code)]
+
+mod keeper;
+mod layout;
+mod raw;
+mod reader;
+mod writer;
+
+pub use keeper::{StoreKeeper, StorePlan};
+pub use layout::{DISPLACEMENT_LEN, STATE_BYTES, StoreSizes};
+pub use reader::{Reader, RestBricks, Snapshot};
+pub use writer::{CommitOutcome, Transaction, Writer};
+
+use thiserror::Error;
+
+/// Why a store could not be made or opened.
+#[derive(Debug, Error)]
+#[allow(missing_docs)] // the sentences say it
+pub enum StoreError {
+    #[error(transparent)]
+    Transport(#[from] maille_transport::TransportError),
+    #[error(
+        "the store's index is not what this program expects ({reason}); it was made by another version or is damaged: run `maille clean`"
+    )]
+    Index { reason: String },
+    #[error(
+        "the store's segment `{segment}` has {found} bytes instead of {expected}: it is truncated or of another version; run `maille clean`"
+    )]
+    Size { segment: &'static str, found: usize, expected: usize },
+}

@@ -39,7 +39,8 @@ impl Domain {
     /// When /dev/shm cannot be written.
     pub fn fresh() -> Result<Self, TransportError> {
         for attempt in 0u32.. {
-            let seed = crate::monotonic_ns() ^ (u64::from(std::process::id()) << 32) ^ u64::from(attempt).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+            let seed =
+                crate::monotonic_ns() ^ (u64::from(std::process::id()) << 32) ^ u64::from(attempt).wrapping_mul(0x9E37_79B9_7F4A_7C15);
             let mixed = (seed ^ (seed >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
             let name = format!("{PREFIX}{:08x}", (mixed >> 32) as u32);
             let (lock_path, making) = (lock_path(&name), Path::new(SHM).join(format!(".{name}.making")));

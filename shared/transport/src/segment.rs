@@ -8,7 +8,13 @@ use iceoryx2::prelude::SemanticString;
 use iceoryx2_bb_posix::shared_memory::{AccessMode, CreationMode, Permission, SharedMemory, SharedMemoryBuilder};
 use iceoryx2_bb_system_types::file_name::FileName;
 use maille_contract::{ControlBlock, control::CONTROL_MAGIC, names::segment};
-use std::{fs::OpenOptions, ops::Deref, path::Path, ptr::NonNull, sync::atomic::Ordering::{Acquire, Relaxed, Release}};
+use std::{
+    fs::OpenOptions,
+    ops::Deref,
+    path::Path,
+    ptr::NonNull,
+    sync::atomic::Ordering::{Acquire, Relaxed, Release},
+};
 
 /// How a segment is mapped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,7 +61,11 @@ impl Segment {
         rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, bytes as u64).map_err(|e| {
             let _ = std::fs::remove_file(&path);
             if e == rustix::io::Errno::NOSPC {
-                TransportError::Full { segment: segment.into(), needed_mib: (bytes as u64).div_ceil(1 << 20), free_mib: free_shm_bytes() >> 20 }
+                TransportError::Full {
+                    segment: segment.into(),
+                    needed_mib: (bytes as u64).div_ceil(1 << 20),
+                    free_mib: free_shm_bytes() >> 20,
+                }
             } else {
                 fail(e.to_string())
             }
@@ -72,9 +82,11 @@ impl Segment {
             Access::Read => AccessMode::Read,
             Access::ReadWrite => AccessMode::ReadWrite,
         };
-        let memory = SharedMemoryBuilder::new(&file_name(domain, segment)?)
-            .open_existing(mode)
-            .map_err(|e| TransportError::Segment { segment: segment.into(), action: "opened", reason: format!("{e:?}") })?;
+        let memory = SharedMemoryBuilder::new(&file_name(domain, segment)?).open_existing(mode).map_err(|e| TransportError::Segment {
+            segment: segment.into(),
+            action: "opened",
+            reason: format!("{e:?}"),
+        })?;
         Ok(Self { memory, access })
     }
 
@@ -111,7 +123,11 @@ impl Segment {
 
 fn file_name(domain: &Domain, segment: &str) -> Result<FileName, TransportError> {
     let name = domain.segment_name(segment);
-    FileName::new(name.as_bytes()).map_err(|e| TransportError::Segment { segment: segment.into(), action: "named", reason: format!("{e:?}") })
+    FileName::new(name.as_bytes()).map_err(|e| TransportError::Segment {
+        segment: segment.into(),
+        action: "named",
+        reason: format!("{e:?}"),
+    })
 }
 
 /// Free bytes in /dev/shm.

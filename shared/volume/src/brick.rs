@@ -29,7 +29,7 @@ pub const ROW: usize = STORED_EDGE;
 /// Offset between stored neighbours along k.
 pub const SLICE: usize = STORED_EDGE * STORED_EDGE;
 /// Stored voxels, padded so that what follows is aligned and four-voxel loads at the end stay inside.
-pub const STORED: usize = (SLICE * STORED_EDGE + 3) / 4 * 4 + 4;
+pub const STORED: usize = (SLICE * STORED_EDGE).next_multiple_of(4) + 4;
 /// Edge of a skip cell, in trilinear cells.
 pub const CELL: usize = 4;
 /// Skip cells along the edge of a brick.
@@ -64,7 +64,7 @@ pub struct Brick {
     padding: [u8; PADDING],
 }
 
-const _: () = assert!(size_of::<Brick>() % 64 == 0, "bricks follow one another on cache lines");
+const _: () = assert!(size_of::<Brick>().is_multiple_of(64), "bricks follow one another on cache lines");
 
 impl Brick {
     /// Offset of the brick's voxel (i, j, k); each may be −APRON_LOW … EDGE + APRON_HIGH − 1.

@@ -69,7 +69,10 @@ impl Pixels {
 
     /// The numbers as `f64`, in order.
     pub fn iter_f64(&self) -> Box<dyn Iterator<Item = f64> + '_> {
-        each!(self, v => Box::new(v.iter().map(|&x| x as f64)))
+        #[allow(clippy::unnecessary_cast)] // one arm of the macro is f64 already
+        {
+            each!(self, v => Box::new(v.iter().map(|&x| x as f64)))
+        }
     }
 
     /// Smallest and largest finite number, `None` when there is none.

@@ -1,0 +1,187 @@
+//! Reading: pin, follow the pinned root, let go.
+
+use crate::{
+    DISPLACEMENT_LEN, STATE_BYTES, StoreError,
+    layout::first_entry,
+    raw::{IndexMap, Slots},
+};
+use maille_contract::control::{PIN_IDLE, PIN_PENDING, Pin};
+use maille_contract::index::{ABSENT, Channel, LEAF_LEN, ROOT_BITS};
+use maille_contract::names::segment;
+use maille_contract::{ControlBlock, Role};
+use maille_transport::{Access, ControlMap, Domain};
+use maille_volume::{Brick, BrickId, BrickLayout, BrickSource, VolumeInfo};
+use std::sync::atomic::Ordering::{Relaxed, Release, SeqCst};
+
+/// A process's read-only view of the store.
+pub struct Reader {
+    control: ControlMap,
+    index: IndexMap,
+    info: VolumeInfo,
+    layout: BrickLayout,
+    rest: Slots<Brick>,
+    versions: Slots<Brick>,
+    displacement: Slots<[f32; DISPLACEMENT_LEN]>,
+    state: Slots<[u8; STATE_BYTES]>,
+    role: Role,
+    first_displacement: usize,
+    first_state: usize,
+}
+
+impl Reader {
+    /// Maps the store read-only; bricks are prefaulted, so that no tick and no frame waits for a page.
+    ///
+    /// # Errors
+    /// When a segment is missing, truncated or of another version.
+    pub fn open(domain: &Domain, role: Role) -> Result<Self, StoreError> {
+        let control = ControlMap::open(domain)?;
+        let (index, info, layout) = IndexMap::open(domain, Access::Read)?;
+        let [voxels, displacement, state] = index.layout.channels;
+        let spare = (voxels.slot_count - voxels.entry_count) as usize;
+        Ok(Self {
+            first_displacement: first_entry(&index.layout, Channel::Displacement),
+            first_state: first_entry(&index.layout, Channel::State),
+            rest: Slots::open(domain, segment::REST, layout.count(), Access::Read, true)?,
+            versions: Slots::open(domain, segment::VERSIONS, spare, Access::Read, true)?,
+            displacement: Slots::open(domain, segment::DISPLACEMENT, displacement.slot_count as usize, Access::Read, false)?,
+            state: Slots::open(domain, segment::STATE, state.slot_count as usize, Access::Read, true)?,
+            control,
+            index,
+            info,
+            layout,
+            role,
+        })
+    }
+
+    /// The control block.
+    pub fn control(&self) -> &ControlBlock {
+        &self.control
+    }
+
+    /// Grid and rescale of the volume.
+    pub fn info(&self) -> &VolumeInfo {
+        &self.info
+    }
+
+    /// The newest committed epoch.
+    pub fn epoch(&self) -> u64 {
+        self.index.head().load(SeqCst) >> ROOT_BITS
+    }
+
+    /// Pins the newest epoch. Wait-free: at most as many steps as the role has pins.
+    ///
+    /// # Panics
+    /// When the role holds all of its pins already: snapshots are being kept that should have been dropped.
+    #[inline]
+    pub fn snapshot(&self) -> Snapshot<'_> {
+        let pins = &self.control.pins[self.role.pins()];
+        let free =
+            |pin: &&Pin| pin.word.load(Relaxed) == PIN_IDLE && pin.word.compare_exchange(PIN_IDLE, PIN_PENDING, SeqCst, Relaxed).is_ok();
+        let pin = pins.iter().find(free).expect("a role holds at most as many snapshots as it has pins");
+        // SYNC POINT: PENDING, then this load ↔ `Writer::publish`'s store of the head, then its look at the pins.
+        let head = self.index.head().load(SeqCst);
+        pin.word.store(head, Release);
+        let root = (head & ((1 << ROOT_BITS) - 1)) as usize;
+        Snapshot { reader: self, pin, head, root }
+    }
+
+    /// The volume at rest, as it was loaded.
+    pub fn rest(&self) -> RestBricks<'_> {
+        RestBricks { info: &self.info, layout: &self.layout, rest: &self.rest }
+    }
+
+    /// Address ranges of the mapped voxels (rest, versions): what a reader dereferences lies inside.
+    pub fn voxel_addresses(&self) -> [std::ops::Range<usize>; 2] {
+        [self.rest.addresses(), self.versions.addresses()]
+    }
+}
+
+/// One consistent state of everything, for as long as it is held.
+pub struct Snapshot<'a> {
+    reader: &'a Reader,
+    pin: &'a Pin,
+    head: u64,
+    root: usize,
+}
+
+impl Snapshot<'_> {
+    /// The epoch that is pinned.
+    pub fn epoch(&self) -> u64 {
+        self.head >> ROOT_BITS
+    }
+
+    #[inline]
+    fn slot(&self, entry: usize) -> u32 {
+        let index = &self.reader.index;
+        let leaf = index.root(self.root)[entry / LEAF_LEN].load(Relaxed);
+        index.leaf(leaf as usize)[entry % LEAF_LEN].load(Relaxed)
+    }
+
+    /// Displacement [mm, along the grid's axes] of a brick's voxels, component after component; `None` where nothing moved.
+    pub fn displacement(&self, id: BrickId) -> Option<&[f32; DISPLACEMENT_LEN]> {
+        if self.reader.index.layout.channels[Channel::Displacement as usize].entry_count == 0 {
+            return None;
+        }
+        assert!((id as usize) < self.reader.layout.count(), "brick {id} of {}", self.reader.layout.count());
+        let slot = self.slot(self.reader.first_displacement + id as usize);
+        (slot != ABSENT).then(|| self.reader.displacement.get(slot as usize))
+    }
+
+    /// The deformation process's small state, as the last commit left it.
+    pub fn state(&self) -> &[u8; STATE_BYTES] {
+        self.reader.state.get(self.slot(self.reader.first_state) as usize)
+    }
+}
+
+impl BrickSource for Snapshot<'_> {
+    fn info(&self) -> &VolumeInfo {
+        &self.reader.info
+    }
+    fn layout(&self) -> &BrickLayout {
+        &self.reader.layout
+    }
+    #[inline]
+    fn brick(&self, id: BrickId) -> &Brick {
+        let count = self.reader.layout.count();
+        assert!((id as usize) < count, "brick {id} of {count}");
+        let slot = self.slot(id as usize) as usize;
+        if slot < count { self.reader.rest.get(slot) } else { self.reader.versions.get(slot - count) }
+    }
+    #[inline]
+    fn stamp(&self, id: BrickId) -> u64 {
+        let slot = self.slot(id as usize) as usize;
+        if slot < self.reader.layout.count() { 0 } else { self.reader.index.slot_records(0)[slot].born.load(Relaxed) }
+    }
+}
+
+impl Drop for Snapshot<'_> {
+    #[inline]
+    fn drop(&mut self) {
+        // SYNC POINT: what was read from the slots happens before the writer sees the pin gone and reuses them.
+        self.pin.word.store(PIN_IDLE, Release);
+    }
+}
+
+/// The volume at rest in shared memory; it never changes.
+#[derive(Clone, Copy)]
+pub struct RestBricks<'a> {
+    pub(crate) info: &'a VolumeInfo,
+    pub(crate) layout: &'a BrickLayout,
+    pub(crate) rest: &'a Slots<Brick>,
+}
+
+impl BrickSource for RestBricks<'_> {
+    fn info(&self) -> &VolumeInfo {
+        self.info
+    }
+    fn layout(&self) -> &BrickLayout {
+        self.layout
+    }
+    #[inline]
+    fn brick(&self, id: BrickId) -> &Brick {
+        self.rest.get(id as usize)
+    }
+    fn stamp(&self, _id: BrickId) -> u64 {
+        0
+    }
+}
