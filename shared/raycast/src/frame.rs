@@ -17,7 +17,7 @@ pub const OPAQUE: f32 = 0.015;
 /// Refinements of a hit inside its step.
 pub const REFINEMENTS: usize = 4;
 /// Directions smaller than this [index per mm] count as this: slabs are then divided by a number.
-const TINY: f32 = 1e-9;
+pub const TINY: f32 = 1e-9;
 
 /// Constants of one frame; f32 because kernels are.
 pub struct Frame {

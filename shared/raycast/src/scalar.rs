@@ -157,12 +157,12 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
         let distance = ray.start + k * f.step;
         let strength = 1.0 / (1.0 + distance * distance * f.falloff);
         let highlight = if square > ZERO_GRADIENT { shading.specular * cosine.powi(shading.power as i32) } else { 0.0 };
-        ((shading.ambient + shading.diffuse * cosine) * strength, highlight * strength)
+        ((shading.ambient * shading.ambient_light + shading.diffuse * cosine) * strength, highlight * strength)
     }
 
     /// Shading of matter cut open where the ray enters the volume or leaves the eye: as if facing the light.
     fn cut(&self) -> (f32, f32) {
-        self.frame.shading.map_or((1.0, 0.0), |s| (s.ambient + s.diffuse, 0.0))
+        self.frame.shading.map_or((1.0, 0.0), |s| (s.ambient * s.ambient_light + s.diffuse, 0.0))
     }
 
     /// Sample number, fractional, at which the threshold is crossed between k − 1 and k (Illinois regula falsi).

@@ -34,12 +34,15 @@ pub enum Light {
     },
 }
 
-/// Phong's model, two-sided: colour · (ambient + diffuse · |n·l|) + specular · |n·h|^power, with h = l for both lights.
-/// Where the gradient vanishes only the ambient part is left.
+/// Blinn and Phong's model, two-sided: colour · (ambient · ambient_light + diffuse · |n·l|) + specular · |n·h|^power, with h = l
+/// for both lights. Where the gradient vanishes only the ambient part is left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shading {
-    /// light from everywhere
+    /// share of light from everywhere that is reflected
     pub ambient: f32,
+    /// how much light from everywhere there is; 0 by default, because the ambient colour of VTK's lights is black and its
+    /// fixed-point mapper keeps to that: without this the same numbers give a brighter picture here
+    pub ambient_light: f32,
     /// share of diffuse reflection
     pub diffuse: f32,
     /// share of the highlight
@@ -52,7 +55,7 @@ pub struct Shading {
 
 impl Default for Shading {
     fn default() -> Self {
-        Self { ambient: 0.1, diffuse: 0.7, specular: 0.2, power: 10, light: Light::Headlight }
+        Self { ambient: 0.1, ambient_light: 0.0, diffuse: 0.7, specular: 0.2, power: 10, light: Light::Headlight }
     }
 }
 
@@ -107,7 +110,7 @@ impl Settings {
     /// The surface at a value, in the colour of bone.
     pub fn isosurface(threshold_hu: f64) -> Self {
         let mode = Mode::Isosurface { threshold_hu, color: [0.93, 0.86, 0.76] };
-        let shading = Some(Shading { ambient: 0.1, diffuse: 0.8, specular: 0.1, ..Shading::default() });
+        let shading = Some(Shading { ambient_light: 1.0, diffuse: 0.8, specular: 0.1, ..Shading::default() });
         Self { mode, shading, ..Self::default() }
     }
 

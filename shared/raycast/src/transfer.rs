@@ -139,6 +139,8 @@ struct File {
 #[serde(deny_unknown_fields)]
 struct FileShading {
     ambient: f64,
+    #[serde(default)]
+    ambient_light: f64,
     diffuse: f64,
     specular: f64,
     power: f64,
@@ -158,12 +160,13 @@ impl Transfer {
         let shading = file
             .shading
             .map(|s| {
-                let fine = [s.ambient, s.diffuse, s.specular].iter().all(|v| (0.0..=10.0).contains(v));
+                let fine = [s.ambient, s.ambient_light, s.diffuse, s.specular].iter().all(|v| (0.0..=10.0).contains(v));
                 if !fine || !(0.0..=1000.0).contains(&s.power) {
                     return Err(TransferError::Value("a shading number out of range (coefficients 0…10, power 0…1000)".into()));
                 }
                 Ok(Shading {
                     ambient: s.ambient as f32,
+                    ambient_light: s.ambient_light as f32,
                     diffuse: s.diffuse as f32,
                     specular: s.specular as f32,
                     power: s.power.round() as u32,
