@@ -28,6 +28,10 @@ use crate::{
 /// before the ball touches it (1/cos 27.4° − 1 = 0.126).
 const PROBE_MARGIN: f64 = 0.2;
 
+/// A foot once found is followed while the gap to the tip is at most this [mm]: tissue that has given way is felt a little longer than
+/// it touches (see `HapticCore`).
+const KEEP_GAP_MM: f64 = 4.0;
+
 /// Where a tip touches, or nearly touches, the surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
@@ -133,7 +137,7 @@ impl Proxy {
             State::Near(foot) => {
                 let found = relax(tissue, x, foot);
                 self.state = match found {
-                    Some(foot) if height(x, &foot) <= self.reach(tissue) * 1.2 => State::Near(foot),
+                    Some(foot) if height(x, &foot) <= self.reach(tissue) + KEEP_GAP_MM => State::Near(foot),
                     _ => State::Free,
                 };
                 if inside {

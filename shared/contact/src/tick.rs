@@ -3,14 +3,15 @@
 //! **Indentation and give-way.** With d the tip's penetration into the tissue *as committed now*, and m the way that tissue under the
 //! tip has given way since the contact began, the indentation is δ = max(0, d + m) and the normal force f(δ) of `material`.
 //! A commit that moves the surface away by Δ lowers d by Δ and raises m by Δ: δ, force and stored energy stay as they were, whatever
-//! the rate of commits. So tissue resists by how far it was pushed from where the tip first met it; on withdrawal the
-//! force falls along the same curve and ends at that place (tissue that lags behind in the voxels is not felt to pull or to
-//! vanish), and when δ reaches 0 the contact ends and m is forgotten. Sliding along the surface by t lets m fade by exp(−t/(2r)):
-//! elsewhere nothing was pushed yet. A surface that comes towards the tip (relaxing or breathing tissue) makes m negative;
-//! that part fades within 0.1 s, so that the tissue's own motion is felt, without a step.
+//! the rate of commits. So tissue resists by how far it was pushed from where the tip first met it. Withdrawn, the tip leaves a dent: with
+//! a gap g between tip and tissue, m fades by exp(−Δg / 1.5 mm) while g grows, so the force ends near the dent that is seen
+//! (a dent that springs back in further commits instead lowers m and raises d, and is felt as elastic). Sliding along the
+//! surface by t lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. At δ = 0 the contact ends and m is forgotten. What is no pushing is carried in a second term β that goes to 0 within 0.1 s, δ = max(0, d + m + β): a
+//! surface that comes towards the tip (relaxing or breathing tissue) beyond where it was met, a new threshold, a foot that
+//! jumps to a nearer wall. So all of these are felt, and none as a step.
 //!
 //! Energy: along the normal the tissue is a spring in δ; a commit leaves δ unchanged; fading m > 0 only lowers the stored
-//! energy. So neither commits nor sliding can feed the hand.
+//! energy. So neither commits nor sliding can feed the hand; β can, as tissue that moves by itself does, by a bounded amount.
 //!
 //! **Blend.** What remains of a discontinuity (normal and tangential direction at a commit, a foot that jumps to another wall, a new
 //! threshold) is bridged: the difference to the last force is added and taken away linearly within `blend_s`.
@@ -35,8 +36,10 @@ use crate::{
     toolmove::{MoveGate, ToolMove},
 };
 
-/// Time in which the part of a give-way that the tissue itself takes back is felt [s].
-const TAKE_BACK_S: f64 = 0.1;
+/// Time constant in which a move of the surface that the tool did not cause comes to be felt [s].
+const BIAS_S: f64 = 0.1;
+/// Growth of the gap over which a give-way is forgotten [mm].
+const GAP_MM: f64 = 1.5;
 /// Time constant of the material under the tip [s]: a tip that slides from mucosa to bone feels no step.
 const MATERIAL_S: f64 = 0.01;
 /// Time constant of the velocity estimate [s].
@@ -160,6 +163,17 @@ pub struct TickOutputs {
     pub faults: Faults,
 }
 
+/// A difference being taken away.
+#[derive(Clone, Copy, Debug)]
+struct Bridge {
+    /// at its beginning [N]
+    difference: V3,
+    /// how much is left, 1 → 0
+    left: f64,
+    /// from 1 to 0 [s]
+    duration_s: f64,
+}
+
 /// State of touch between ticks.
 pub struct HapticCore {
     config: HapticConfig,
@@ -176,12 +190,15 @@ pub struct HapticCore {
     threshold: f64,
     /// m [mm]
     give_way: f64,
+    /// β [mm]
+    bias: f64,
+    /// largest gap between tip and tissue since they last touched [mm]
+    gap: f64,
     last_point: Option<V3>,
     material: Option<Material>,
     /// force before limits at the last tick [N]
     last_wanted: V3,
-    /// difference being taken away [N], and how much of the blend is left, 1 → 0
-    bridge: (V3, f64),
+    bridge: Bridge,
 }
 
 impl HapticCore {
@@ -203,10 +220,12 @@ impl HapticCore {
             epoch: None,
             threshold: f64::NAN,
             give_way: 0.0,
+            bias: 0.0,
+            gap: 0.0,
             last_point: None,
             material: None,
             last_wanted: V3::zeros(),
-            bridge: (V3::zeros(), 0.0),
+            bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
             config,
         }
     }
@@ -318,32 +337,32 @@ impl HapticCore {
         let threshold = tissue.threshold();
         let other_surface = self.threshold != threshold && !self.threshold.is_nan();
         self.threshold = threshold;
+        let was_felt = self.last_point.is_some();
         if jumped {
             self.proxy.reset();
             self.end_contact();
         }
         let before = self.proxy.height_over_foot_mm(x.into()).map(|h| radius - h);
-        let was_felt = self.last_point.is_some();
         let touch = self.proxy.update(tissue, x.into());
+        let lost = was_felt.then_some(self.config.limits.fade_s.max(self.config.blend_s));
         let Touch::Surface { contact, moved } = touch else {
             out.buried = touch == Touch::Buried;
             // the surface went away inside tissue, or the tip is free
             self.faults.lost_contacts += u64::from(out.buried && was_felt);
             self.end_contact();
-            return self.bridged(V3::zeros(), dt, was_felt);
+            return self.bridged(V3::zeros(), dt, lost);
         };
         let (point, normal) = (V3::from(contact.point_mm), V3::from(contact.normal));
         let d = contact.penetration_mm;
-        let discontinuous = committed || other_surface || moved;
-        if was_felt {
-            self.carry(before, d, point, discontinuous, dt);
-        } else {
-            self.give_way = 0.0;
+        let blend = (was_felt && (committed || other_surface || moved)).then_some(self.config.blend_s);
+        if self.last_point.is_some() {
+            let change = before.filter(|_| blend.is_some()).map(|before| before - d);
+            self.carry(change, committed && !other_surface, d, point, dt);
         }
-        let delta = (d + self.give_way).max(0.0);
-        if delta <= 0.0 {
+        let delta = (d + self.give_way + self.bias).max(0.0);
+        if delta <= 0.0 && d <= 0.0 {
             self.end_contact();
-            return self.bridged(V3::zeros(), dt, was_felt && discontinuous);
+            return self.bridged(V3::zeros(), dt, if jumped { lost } else { blend });
         }
         self.last_point = Some(point);
         let force = self.contact_force(tissue, point, normal, delta, dt);
@@ -362,24 +381,35 @@ impl HapticCore {
             radius_mm: radius,
             sequence,
         });
-        self.bridged(force, dt, was_felt && discontinuous)
+        self.bridged(force, dt, blend)
     }
 
-    /// Carries the give-way over a tick: a surface that moved changes d and m by opposite amounts, sliding and time let m fade.
-    fn carry(&mut self, before: Option<f64>, d: f64, point: V3, discontinuous: bool, dt: f64) {
+    /// Carries m and β over a tick. A surface that moved changed d by −`change`: that goes to m when a commit did it (β takes what
+    /// would make m negative) and to β when not. Sliding, a growing gap and time let them fade.
+    fn carry(&mut self, change: Option<f64>, committed: bool, d: f64, point: V3, dt: f64) {
         let travelled = self.last_point.map_or(V3::zeros(), |last| point - last);
-        if discontinuous {
-            if let Some(before) = before {
-                self.give_way += before - d;
+        match change {
+            Some(change) if committed => {
+                self.give_way += change;
+                self.bias += self.give_way.min(0.0);
+                self.give_way = self.give_way.max(0.0);
+                self.friction.carry(travelled);
             }
-            self.friction.carry(travelled);
-        } else if self.give_way > 0.0 {
-            self.give_way *= (-travelled.norm() / (2.0 * self.proxy.radius_mm())).exp();
+            Some(change) => {
+                self.bias += change;
+                self.friction.carry(travelled);
+            }
+            None => self.give_way *= (-travelled.norm() / (2.0 * self.proxy.radius_mm())).exp(),
         }
-        if self.give_way < 0.0 {
-            self.give_way *= (-dt / TAKE_BACK_S).exp();
+        let gap = (-d).max(0.0);
+        if change.is_some() || gap == 0.0 {
+            self.gap = gap;
+        } else if gap > self.gap {
+            self.give_way *= ((self.gap - gap) / GAP_MM).exp();
+            self.gap = gap;
         }
-        self.give_way = self.give_way.clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
+        self.bias = (self.bias * (-dt / BIAS_S).exp()).clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
+        self.give_way = self.give_way.min(MAX_GIVE_WAY_MM);
     }
 
     /// Normal force, damping and friction [N].
@@ -402,18 +432,20 @@ impl HapticCore {
         force
     }
 
-    /// Bridges a discontinuity: continues from the last force and lets the difference go within the blend time.
-    fn bridged(&mut self, force: V3, dt: f64, discontinuous: bool) -> V3 {
-        if discontinuous {
-            self.bridge = (self.last_wanted - force, 1.0);
+    /// Bridges a discontinuity: continues from the last force and lets the difference go within `over_s`.
+    fn bridged(&mut self, force: V3, dt: f64, over_s: Option<f64>) -> V3 {
+        if let Some(duration_s) = over_s {
+            self.bridge = Bridge { difference: self.last_wanted - force, left: 1.0, duration_s };
             return self.last_wanted;
         }
-        self.bridge.1 = (self.bridge.1 - dt / self.config.blend_s).max(0.0);
-        force + self.bridge.0 * self.bridge.1
+        self.bridge.left = (self.bridge.left - dt / self.bridge.duration_s).max(0.0);
+        force + self.bridge.difference * self.bridge.left
     }
 
     fn end_contact(&mut self) {
         self.give_way = 0.0;
+        self.bias = 0.0;
+        self.gap = 0.0;
         self.last_point = None;
         self.material = None;
         self.friction.release();
