@@ -18,6 +18,7 @@
 #![forbid(unsafe_code)]
 
 pub mod coupling;
+mod cubic;
 pub mod device;
 pub mod friction;
 pub mod limits;

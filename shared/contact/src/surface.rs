@@ -3,7 +3,8 @@
 //! Tissue is where value ≥ threshold. The surface's normal points out of the tissue, n = −∇v / |∇v|. Outside the volume
 //! there is no tissue, and the faces where the image ends are no surface.
 
-use maille_volume::{BrickSource, Sampler, VolumeSample};
+use crate::cubic::CubicSampler;
+use maille_volume::{BrickSource, VolumeSample};
 
 /// A field with a threshold.
 pub trait Surface {
@@ -17,9 +18,10 @@ pub trait Surface {
     fn resolution_mm(&self) -> f64;
 }
 
-/// The isosurface of voxels in bricks. Cheap to make (one 3×3 inverse): made anew for every snapshot or tick.
+/// The isosurface of voxels in bricks, interpolated by cubic splines (`cubic`). Cheap to make (one 3×3 inverse): made anew for
+/// every snapshot or tick.
 pub struct Isosurface<'a, S: BrickSource + ?Sized> {
-    sampler: Sampler<'a, S>,
+    sampler: CubicSampler<'a, S>,
     threshold: f64,
     resolution_mm: f64,
 }
@@ -27,7 +29,7 @@ pub struct Isosurface<'a, S: BrickSource + ?Sized> {
 impl<'a, S: BrickSource + ?Sized> Isosurface<'a, S> {
     /// The surface where the voxels' value reaches `threshold` (HU).
     pub fn new(source: &'a S, threshold: f64) -> Self {
-        Self { sampler: Sampler::new(source), threshold, resolution_mm: source.info().grid.min_spacing() }
+        Self { sampler: CubicSampler::new(source), threshold, resolution_mm: source.info().grid.min_spacing() }
     }
 }
 

@@ -18,8 +18,16 @@ fn press(every: u64, mut each: impl FnMut(u64, f64, &maille_contact::TickOutputs
     let (mut surface, mut epoch, mut told) = (0.0, 1, None);
     for n in 0..900u64 {
         let t = n as f64 * 1e-3;
-        let z = if t < 0.3 { 3.5 - 25.0 * t } else if t < 0.5 { -4.0 } else { -4.0 + 25.0 * (t - 0.5) };
-        if n % every == 0 && let Some(depth) = told.take() {
+        let z = if t < 0.3 {
+            3.5 - 25.0 * t
+        } else if t < 0.5 {
+            -4.0
+        } else {
+            -4.0 + 25.0 * (t - 0.5)
+        };
+        if n % every == 0
+            && let Some(depth) = told.take()
+        {
             surface -= depth;
             epoch += 1;
         }

@@ -43,7 +43,10 @@ fn disturbed(bad: impl Fn(u64) -> DevicePose) -> Faults {
     let mut last = V3::from(d.tick(&tissue, 1, V3::new(0.0, 0.0, 12.0)).force_n);
     let mut check = |out: TickOutputs| {
         let f = V3::from(out.force_n);
-        assert!(f.iter().all(|c| c.is_finite()) && f.norm() <= MAX_FORCE_N + 1e-9 && (f - last).norm() <= MAX_STEP_N + 1e-9, "{last:?} {f:?}");
+        assert!(
+            f.iter().all(|c| c.is_finite()) && f.norm() <= MAX_FORCE_N + 1e-9 && (f - last).norm() <= MAX_STEP_N + 1e-9,
+            "{last:?} {f:?}"
+        );
         last = f;
         out
     };
@@ -121,7 +124,8 @@ fn a_lost_snapshot_a_stale_pose_and_the_end_fade_within_the_time_declared() {
 /// A scripted press with commits of another volume in between.
 fn scripted(ticks: u64, volumes: &[BrickedVolume], mut each: impl FnMut(&TickOutputs)) {
     let point = |time_s: f64, z: f64, x: f64| WayPoint { time_s, position_mm: [x, 0.0, z], direction: [0.0, 0.0, -1.0] };
-    let path = Path::new(&[point(0.0, 18.0, 0.0), point(0.5, 11.0, 0.0), point(1.0, 10.0, 4.0), point(1.5, 18.0, 0.0)], true, Easing::MinimumJerk);
+    let path =
+        Path::new(&[point(0.0, 18.0, 0.0), point(0.5, 11.0, 0.0), point(1.0, 10.0, 4.0), point(1.5, 18.0, 0.0)], true, Easing::MinimumJerk);
     let mut device = PathDevice::new(path.unwrap(), 0);
     let mut core = HapticCore::new(HapticConfig { passivity: true, ..config() });
     assert_steady(|| {
@@ -130,7 +134,8 @@ fn scripted(ticks: u64, volumes: &[BrickedVolume], mut each: impl FnMut(&TickOut
             let epoch = n / 40;
             let tissue = Isosurface::new(&volumes[epoch as usize % volumes.len()], 0.0);
             let pose = device.read(now_ns);
-            let out = core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&tissue), epoch, tissue_age_s: 0.0, release: false });
+            let out =
+                core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&tissue), epoch, tissue_age_s: 0.0, release: false });
             device.write(out.force_n);
             each(&out);
         }

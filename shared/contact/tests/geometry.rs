@@ -14,8 +14,7 @@ fn directions(count: usize) -> impl Iterator<Item = V3> {
     })
 }
 
-/// Truth: depth R + r − |x|, along x. At 1 mm the trilinear surface of a ball of 10 mm lies up to h²/8 · 2/R = 0.025 mm beside the true one;
-/// at depths from 2.5 mm on that is 1 %. The normal's bound is the 1°.
+/// Truth: depth R + r − |x|, along x. Bounds: the issue's, 1 % and 1°; the splines leave some 0.01 mm of 1 mm and 0.3°.
 #[test]
 fn force_on_a_ball_has_its_normal_within_one_degree_and_its_size_within_one_per_cent() {
     for radius in [10.0, 12.5, 18.0] {
@@ -35,11 +34,11 @@ fn force_on_a_ball_has_its_normal_within_one_degree_and_its_size_within_one_per_
                 } else if depth >= 1.0 {
                     let f = V3::from(out.force_n);
                     worst_angle = worst_angle.max(f.angle(&u).to_degrees());
-                    if depth >= 2.5 {
+                    if depth >= 1.0 {
                         worst_size = worst_size.max((f.norm() / (0.5 * depth) - 1.0).abs());
                     }
-                    assert!(out.in_contact && (out.penetration_mm - depth).abs() < 0.04, "{radius} {depth}: {}", out.penetration_mm);
-                    assert!((V3::from(out.proxy_mm).norm() - radius - 2.0).abs() < 0.04);
+                    assert!(out.in_contact && (out.penetration_mm - depth).abs() < 0.02, "{radius} {depth}: {}", out.penetration_mm);
+                    assert!((V3::from(out.proxy_mm).norm() - radius - 2.0).abs() < 0.02);
                 }
             }
         }

@@ -65,6 +65,14 @@ impl Driver {
 
     pub fn tick_pose<S: Surface>(&mut self, tissue: &S, epoch: u64, pose: DevicePose) -> TickOutputs {
         self.now_ns += 1_000_000;
-        self.core.tick(&TickInputs { now_ns: self.now_ns, pose, pose_age_s: 0.0, tissue: Some(tissue), epoch, tissue_age_s: 0.0, release: false })
+        self.core.tick(&TickInputs {
+            now_ns: self.now_ns,
+            pose,
+            pose_age_s: 0.0,
+            tissue: Some(tissue),
+            epoch,
+            tissue_age_s: 0.0,
+            release: false,
+        })
     }
 }
