@@ -63,7 +63,7 @@ fn outer(at: &At) -> f64 {
         d = smooth_max(d, -cone(&q, &v(0.0, -95.0, -60.0), 2.2, &v(24.0, -86.0, -61.5), 1.2), 3.0);
         d = smooth_min(d, nose::outside(&q), 8.0);
         // the ear's shell, tilted back
-        let ear = v(q.x - 79.0, (q.y - 22.0) * 0.96 + (q.z + 2.0) * 0.27, (q.z + 2.0) * 0.96 - (q.y - 22.0) * 0.27);
+        let ear = v(q.x - 74.0, (q.y - 22.0) * 0.96 + (q.z + 2.0) * 0.27, (q.z + 2.0) * 0.96 - (q.y - 22.0) * 0.27);
         let ear = v(ear.x * 0.93 - ear.y * 0.37, ear.y * 0.93 + ear.x * 0.37, ear.z);
         let shell = slab(&ear, v(3.0, 4.0, 0.0), v(3.2, 16.0, 29.0), 3.2);
         let shell = smooth_max(shell, -ellipsoid(&ear, v(7.0, 0.0, -4.0), v(5.0, 9.0, 14.0)), 2.0);
@@ -134,11 +134,11 @@ fn neck(parts: &mut Parts) {
         parts.add_cone(Label::Gland, [side * 24.0, -26.0, -84.0], 8.0, [side * 30.0, -14.0, -84.0], 7.0);
     }
     for n in 0..5 {
-        let (y, z) = (41.0 + 0.8 * f64::from(n), -52.0 - 17.0 * f64::from(n));
+        let (y, z) = (26.0 + 0.6 * f64::from(n), -52.0 - 17.0 * f64::from(n));
         vertebra(parts, v(0.0, y, z));
     }
     // fluid around the cord, down from the foramen magnum
-    parts.add_cone(Label::Fluid, [0.0, 40.0, -26.0], 9.0, [0.0, 63.0, -190.0], 8.0);
+    parts.add_cone(Label::Fluid, [0.0, 39.0, -26.0], 8.5, [0.0, 49.0, -190.0], 7.5);
     // nasopharynx to windpipe; in front of it tongue and palate
     parts.add_cone(Label::Mucosa, [0.0, -8.0, -41.0], 12.0, [0.0, 6.0, -66.0], 9.5);
     parts.add_cone(Label::Mucosa, [0.0, 6.0, -66.0], 9.5, [0.0, 12.0, -190.0], 9.0);

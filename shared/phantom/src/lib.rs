@@ -59,6 +59,8 @@ struct Landmarks {
     lesion: Option<([f64; 3], f64)>,
     skin_entry: [f64; 3],
     needle_target: [f64; 3],
+    /// points outside from which a straight way to `needle_target` may be tried, best first
+    ways: Vec<[f64; 3]>,
 }
 
 impl Phantom {
@@ -69,7 +71,9 @@ impl Phantom {
             Kind::Torso => torso::build(seed),
         };
         let mut phantom = Self { kind, seed, extent, parts, landmarks: Landmarks::default() };
-        landmarks.skin_entry = phantom.skin_on_the_way(landmarks.skin_entry, landmarks.needle_target);
+        let target = landmarks.needle_target;
+        let way = landmarks.ways.iter().find(|&&from| phantom.is_soft_way(from, target)).or(landmarks.ways.first());
+        landmarks.skin_entry = phantom.skin_on_the_way(*way.expect("every phantom has a way in"), target);
         phantom.landmarks = landmarks;
         phantom
     }
@@ -154,6 +158,24 @@ impl Phantom {
     /// What a needle from [`Self::skin_entry`] aims at [mm]: the lesion (torso), or a point deep in the cheek (head).
     pub fn needle_target(&self) -> [f64; 3] {
         self.landmarks.needle_target
+    }
+
+    /// Whether a needle 3 mm thick meets neither bone nor lung, gas, vessel or duct on a straight way.
+    fn is_soft_way(&self, from: [f64; 3], to: [f64; 3]) -> bool {
+        let (a, b) = (Vector3::from(from), Vector3::from(to));
+        let along = (b - a).normalize();
+        let across = along.cross(&Vector3::z()).normalize();
+        let rays = [Vector3::zeros(), across, -across, along.cross(&across), across.cross(&along)].map(|side| a + 1.5 * side);
+        rays.iter().all(|start| {
+            let mut inside = false;
+            (0..(b - a).norm() as usize).all(|s| {
+                let label = self.label((start + along * s as f64).into());
+                inside |= label != Label::Air;
+                let forbidden = label.is_rigid()
+                    || matches!(label, Label::Lung | Label::Vessel | Label::LiverVessel | Label::BileDuct | Label::Cartilage);
+                !(forbidden || inside && label == Label::Air)
+            })
+        })
     }
 
     /// First point that is not air from `outside` to `inside`, to a hundredth of a millimetre.

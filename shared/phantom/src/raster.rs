@@ -36,13 +36,14 @@ struct Sorted {
     active: Range<usize>,
 }
 
-/// Sorts the parts for one block; numbers of active parts are appended to `active`.
-fn sort(parts: &[Part], low: Vector3<f64>, high: Vector3<f64>, margin: f64, active: &mut Vec<u16>) -> Sorted {
+/// Sorts the parts `near` a block; numbers of active parts are appended to `active`.
+fn sort(parts: &[Part], near: &[u16], low: Vector3<f64>, high: Vector3<f64>, margin: f64, active: &mut Vec<u16>) -> Sorted {
     let (center, radius) = (0.5 * (low + high), 0.5 * (high - low).norm());
     let at = At::new(center);
     let first = active.len();
     let mut base = Label::Air;
-    for (n, part) in parts.iter().enumerate().rev() {
+    for &n in near.iter().rev() {
+        let part = &parts[usize::from(n)];
         // within its box a part may reach; a soft edge may stand out by `margin`
         if (0..3).any(|c| low[c] > part.high[c] + margin || high[c] < part.low[c] - margin) {
             continue;
@@ -57,7 +58,7 @@ fn sort(parts: &[Part], low: Vector3<f64>, high: Vector3<f64>, margin: f64, acti
             base = part.label;
             break;
         }
-        active.push(n as u16);
+        active.push(n);
     }
     active[first..].reverse();
     Sorted { base, active: first..active.len() }
@@ -77,13 +78,16 @@ fn for_rows<T: Send>(
     let center = |c: usize, n: usize| grid.origin[c] + n as f64 * grid.spacing[c];
     out.par_chunks_mut(nx * ny * BLOCK).enumerate().for_each(|(slab, out)| {
         let k0 = slab * BLOCK;
+        let (z0, z1) = (center(2, k0), center(2, (k0 + BLOCK).min(nz) - 1));
+        let reaches = |part: &Part| z0 <= part.high.z + margin && z1 >= part.low.z - margin;
+        let near: Vec<u16> = (0..parts.len() as u16).filter(|&n| reaches(&parts[usize::from(n)])).collect();
         let mut active = Vec::new();
         let sorted: Vec<Sorted> = (0..by * bx)
             .map(|b| {
                 let first = [b % bx * BLOCK, b / bx * BLOCK, k0];
                 let low = Vector3::from_fn(|c, _| center(c, first[c]));
                 let high = Vector3::from_fn(|c, _| center(c, (first[c] + BLOCK).min([nx, ny, nz][c]) - 1));
-                sort(parts, low, high, margin, &mut active)
+                sort(parts, &near, low, high, margin, &mut active)
             })
             .collect();
         for (n, out) in out.chunks_mut(nx).enumerate() {

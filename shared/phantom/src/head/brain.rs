@@ -47,8 +47,8 @@ pub(super) fn add(parts: &mut Parts, random: &mut Random) {
     parts.add(Label::Fluid, [-3.0, 0.0, 8.0], [3.0, 30.0, 30.0], 1.2, |at| slab(&at.p, v(0.0, 15.0, 19.0), v(2.0, 12.0, 9.0), 1.9));
     // brain stem and cord
     parts.add_cone(Label::WhiteMatter, [0.0, 14.0, 8.0], 13.0, [0.0, 24.0, -12.0], 12.5);
-    parts.add_cone(Label::WhiteMatter, [0.0, 24.0, -12.0], 11.0, [0.0, 40.0, -44.0], 5.5);
-    parts.add_cone(Label::Nerve, [0.0, 40.0, -44.0], 5.0, [0.0, 63.0, -190.0], 4.6);
+    parts.add_cone(Label::WhiteMatter, [0.0, 24.0, -12.0], 11.0, [0.0, 41.0, -44.0], 5.0);
+    parts.add_cone(Label::Nerve, [0.0, 41.0, -44.0], 4.8, [0.0, 49.0, -190.0], 4.4);
     parts.add_cone(Label::Fluid, [0.0, 36.0, -2.0], 4.0, [0.0, 37.0, -14.0], 3.0);
     vessels(parts, random);
 }

@@ -150,8 +150,8 @@ fn landmarks() -> Landmarks {
         nostril: Some([8.0, -96.5, -41.0]),
         nasal_path,
         nasal_clearance: CLEARANCE,
-        lesion: None,
-        skin_entry: [70.0, -120.0, -44.0],
-        needle_target: [36.0, -54.0, -44.0],
+        needle_target: [38.0, -62.0, -46.0],
+        ways: vec![[62.0, -120.0, -46.0]],
+        ..Default::default()
     }
 }
