@@ -1,0 +1,89 @@
+//! A hand slides over a real head, skin and skull: contact kept, no steps, bounded force. Data: `MAILLE_DATA`, else `../shared/data`.
+
+mod common;
+
+use common::*;
+use maille_contact::{Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, SimulatedHand, Surface, TickInputs};
+use maille_realtime::{BUCKETS, bucket, monotonic_ns, percentiles};
+use maille_volume::{BrickSource, BrickedVolume, io::read_volume};
+use std::path::PathBuf;
+
+fn head() -> Option<BrickedVolume> {
+    let data = std::env::var("MAILLE_DATA").unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data").into());
+    let path = PathBuf::from(data).join("ct_head_invesalius/cranium_lps.nrrd");
+    if !path.exists() {
+        assert!(std::env::var_os("CI").is_none(), "{} is missing, and CI requires it", path.display());
+        #[allow(clippy::disallowed_macros)] // a test that did not run says so
+        {
+            eprintln!("SKIPPED: {} is missing; set MAILLE_DATA", path.display());
+        }
+        return None;
+    }
+    Some(BrickedVolume::from_volume(&read_volume(&path).expect("the head can be read").0))
+}
+
+/// Slides along an arc around the head's middle at 50 mm/s, the hand wanting 12 mm below the surface. Gives the largest step in parts of
+/// max(force, 0.5 N), the part of ticks in contact, and prints the time of a tick.
+fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64, grip: Grip) -> (f64, f64) {
+    let tissue = Isosurface::new(volume, threshold);
+    let center = V3::from(volume.info().grid.center());
+    let direction = |angle: f64| V3::new(angle.sin(), -angle.cos(), elevation).normalize();
+    // the surface from outside along a ray
+    let surface = |u: V3| {
+        let mut r = 140.0;
+        while r > 20.0 && !tissue.value((center + u * r).into()).is_some_and(|v| v >= threshold) {
+            r -= 0.5;
+        }
+        r
+    };
+    let mut core = HapticCore::new(HapticConfig::new(radius_mm, Coupling::new(2.0, 5e-4, 0.003, 1e-3).unwrap()));
+    let start = direction(-0.4);
+    let from = center + start * (surface(start) + radius_mm + 4.0);
+    let mut hand = SimulatedHand::new(grip, from.into(), (-start).into());
+    let (mut worst, mut touched, mut last) = (0.0f64, 0u32, None::<V3>);
+    let mut counts = vec![0u64; BUCKETS];
+    let ticks = 2600u64;
+    let mut angle = -0.4;
+    for n in 0..ticks {
+        let u = direction(angle);
+        let r = surface(u);
+        if n < 600 {
+            hand.set_target((center + u * (r + radius_mm + 4.0 - 16.0 * n as f64 / 600.0)).into());
+        } else {
+            angle += 0.05 / r;
+            hand.set_target((center + u * (r + radius_mm - 12.0)).into());
+        }
+        let now_ns = n * 1_000_000;
+        let pose = hand.read(now_ns);
+        let before = monotonic_ns();
+        let out =
+            core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&tissue), epoch: 0, tissue_age_s: 0.0, release: false });
+        counts[bucket(monotonic_ns() - before)] += 1;
+        hand.write(out.force_n);
+        let f = V3::from(out.force_n);
+        assert!(f.norm() <= 3.3 + 1e-9 && f.iter().all(|c| c.is_finite()));
+        if n >= 1000 {
+            touched += u32::from(out.in_contact);
+            if let Some(last) = last {
+                worst = worst.max((f - last).norm() / f.norm().max(0.5));
+            }
+        }
+        last = Some(f);
+    }
+    #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
+    {
+        println!("threshold {threshold}: tick {:?} ns, worst step {:.2} %", percentiles(counts), worst * 100.0);
+    }
+    (worst, f64::from(touched) / (ticks - 1000) as f64)
+}
+
+#[test]
+fn sliding_over_skin_and_skull_keeps_contact_and_gives_no_step() {
+    let Some(volume) = head() else { return };
+    // skin at the nose's height; skull over the forehead, where no orbit opens
+    for (threshold, elevation, grip) in [(-300.0, 0.35, Grip::LIGHT), (-300.0, 0.35, Grip::FULL), (276.0, 1.2, Grip::LIGHT), (276.0, 1.2, Grip::FULL)] {
+        let (worst, touched) = slide(&volume, threshold, elevation, 3.0, grip);
+        assert!(touched > 0.9, "threshold {threshold}: {:.0} % of ticks in contact", touched * 100.0);
+        assert!(worst <= 0.05, "threshold {threshold}: worst step {:.1} %", worst * 100.0);
+    }
+}
