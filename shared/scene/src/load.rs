@@ -9,7 +9,7 @@ use crate::{
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, Scene, Size},
     suggest,
-    tool::{Device, PathPoint},
+    tool::{Approach, Device, PathPoint},
 };
 use serde::Deserialize;
 use std::{
@@ -20,7 +20,7 @@ use std::{
 use toml::{Spanned, de::DeTable};
 
 /// Transfer functions known by name.
-pub const TRANSFER_PRESETS: &[&str] = &["ct", "bone", "soft", "lung"];
+pub const TRANSFER_PRESETS: &[&str] = &["ct", "bone", "soft-tissue", "lung", "skin"];
 
 const BUILTIN: &str = include_str!("../../../config/default.toml");
 
@@ -296,21 +296,31 @@ fn check_tool(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     check_range(document, "tool.hand.stiffness_n_per_mm", tool.hand.stiffness_n_per_mm, [0.01, 10.0], "N/mm", faults);
     check_range(document, "tool.hand.damping_n_s_per_mm", tool.hand.damping_n_s_per_mm, [0.0, 1.0], "N·s/mm", faults);
     check_range(document, "tool.hand.mass_kg", tool.hand.mass_kg, [0.01, 5.0], "kg", faults);
-    if let Some(a) = &tool.approach {
-        check_range(document, "tool.approach.press_mm", a.press_mm, [0.1, 50.0], "mm", faults);
-        check_range(document, "tool.approach.hover_mm", a.hover_mm, [0.0, 100.0], "mm", faults);
-        check_range(document, "tool.approach.period_s", a.period_s, [0.2, 600.0], "s", faults);
-        check_range(document, "tool.approach.lateral_mm", a.lateral_mm, [0.0, 50.0], "mm", faults);
-        for (name, at) in [("from", &a.from), ("toward", &a.toward)] {
-            (0..3).for_each(|c| check_range(document, &format!("tool.approach.{name}.{c}"), at[c], [-0.5, 1.5], "of the box", faults));
-        }
-        if a.from == a.toward {
-            faults.push(document.fault("tool.approach.toward", "the approach starts where it ends", "the same point as `from`", None));
+    for (key, approach) in [("approach", &tool.approach), ("elsewhere", &tool.elsewhere)] {
+        if let Some(approach) = approach {
+            check_approach(document, &format!("tool.{key}"), approach, faults);
         }
     }
     if tool.path.is_empty() && tool.approach.is_none() {
         let help = Some("add [[tool.path]] way points, or a [tool.approach] that finds the surface itself".into());
         faults.push(document.fault("tool", "[tool] has no way to go", "neither way points nor an approach", help));
+    }
+}
+
+fn check_approach(document: &Document, key: &str, a: &Approach, faults: &mut Vec<Fault>) {
+    for (field, value, range, unit) in [
+        ("press_mm", a.press_mm, [0.1, 50.0], "mm"),
+        ("hover_mm", a.hover_mm, [0.0, 100.0], "mm"),
+        ("period_s", a.period_s, [0.2, 600.0], "s"),
+        ("lateral_mm", a.lateral_mm, [0.0, 50.0], "mm"),
+    ] {
+        check_range(document, &format!("{key}.{field}"), value, range, unit, faults);
+    }
+    for (field, at) in [("from", &a.from), ("toward", &a.toward)] {
+        (0..3).for_each(|c| check_range(document, &format!("{key}.{field}.{c}"), at[c], [-0.5, 1.5], "of the box", faults));
+    }
+    if a.from == a.toward {
+        faults.push(document.fault(&format!("{key}.toward"), "the approach ends where it starts", "the same point as `from`", None));
     }
 }
 

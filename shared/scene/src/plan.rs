@@ -4,9 +4,11 @@
 //! the bricks of this volume; stages are theirs. What no active effect asks for is not in the plan, and what is not in the plan
 //! is not there at run time.
 //!
-//! Spare slots (DESIGN D2): (readers + 1) × the largest dirty set, at most (readers + 1) versions of every brick. The largest
-//! dirty set is bounded from the scene: with link limits o·s a displacement of at most m dies out within m / o along
-//! each axis, so a push dirties at most the bricks of an octahedron of that radius and the aprons around it.
+//! Memory (DESIGN D2, D12): the rest bricks, once; a version of each brick beside it, for in time a tool reaches them all; and spare
+//! slots for what is pinned while it is replaced: (readers + 1) × the largest dirty set. That set is bounded from the
+//! scene: with link limits o·s a displacement of at most m dies out within m / o along each axis, so a push dirties
+//! at most the bricks of an octahedron of that radius and the aprons around it. Displacements are the writer's own: one version
+//! a brick, two of the dirty set.
 
 use crate::{
     limits,
@@ -65,8 +67,14 @@ pub struct Plan {
     pub channels: Vec<&'static Channel>,
     /// readers that may pin a snapshot at once
     pub readers: usize,
-    /// slots beyond one a brick
+    /// bricks that one commit can rewrite at most
+    pub dirty_bricks: usize,
+    /// slots for versions that are pinned while they are replaced: (readers + 1) × `dirty_bricks`, or as the scene says
     pub spare_slots: usize,
+    /// slots of voxel versions beside the rest bricks
+    pub version_slots: usize,
+    /// slots of displacement versions
+    pub displacement_slots: usize,
     /// knobs of the active effects with their values
     pub knobs: Vec<(&'static Knob, f64)>,
     /// panels of the page
@@ -101,22 +109,45 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
         }
     }
     // nothing is ever rewritten without a channel that says by what
-    let spare_slots = if channels.is_empty() { 0 } else { spare_slots(scene, grid, &layout, readers, &channels) };
-    let slots = bricks + spare_slots;
-    let segment = |channel: &Channel| SegmentPlan {
-        name: channel.name,
-        meaning: channel.meaning,
+    let moves = channels.contains(&&DISPLACEMENT);
+    let dirty_bricks = if moves { largest_dirty_set(scene, grid, &layout) } else { 0 };
+    let told = scene.memory.spare_slots.or(scene.memory.spare_mib.map(|mib| ((mib << 20) as usize / VOXELS.brick_bytes).max(8)));
+    let spare_slots = if moves { told.unwrap_or((readers + 1) * dirty_bricks) } else { 0 };
+    // spare slots that the scene gives are all there is
+    let version_slots = if moves { told.unwrap_or(bricks + spare_slots) } else { 0 };
+    let displacement_slots = if moves { bricks.min(version_slots) + 2 * dirty_bricks } else { 0 };
+
+    let of_bricks = |name, meaning, slots: usize, channel: &Channel| SegmentPlan {
+        name,
+        meaning,
         slots,
         bytes: slots as u64 * channel.brick_bytes as u64,
     };
-    let mut segments =
-        vec![SegmentPlan { name: "control", meaning: "clock, pins, heartbeats, last state", slots: 0, bytes: CONTROL_BYTES }];
-    segments.push(segment(&VOXELS));
-    segments.extend(channels.iter().map(|c| segment(c)));
+    let mut segments = vec![
+        SegmentPlan { name: "control", meaning: "clock, pins, heartbeats, last state", slots: 0, bytes: CONTROL_BYTES },
+        of_bricks("rest", "CT values at rest, with aprons and skip cells", bricks, &VOXELS),
+    ];
+    if moves {
+        segments.push(of_bricks("versions", "rewritten CT values", version_slots, &VOXELS));
+        segments.push(of_bricks(DISPLACEMENT.name, DISPLACEMENT.meaning, displacement_slots, &DISPLACEMENT));
+    }
 
     let knobs = KNOBS.iter().filter(|k| effects.iter().any(|e| e.name == k.effect)).map(|k| (k, (k.get)(scene))).collect();
     let panels = if scene.console.enabled { effects.iter().flat_map(|e| e.panels).copied().collect() } else { Vec::new() };
-    Plan { bricks, effects, processes, segments, channels, readers, spare_slots, knobs, panels }
+    Plan {
+        bricks,
+        effects,
+        processes,
+        segments,
+        channels,
+        readers,
+        dirty_bricks,
+        spare_slots,
+        version_slots,
+        displacement_slots,
+        knobs,
+        panels,
+    }
 }
 
 impl Plan {
@@ -176,17 +207,6 @@ fn threads(process: Process, scene: &Scene, machine: Machine) -> usize {
     }
 }
 
-fn spare_slots(scene: &Scene, grid: &Grid, layout: &BrickLayout, readers: usize, channels: &[&'static Channel]) -> usize {
-    if let Some(slots) = scene.memory.spare_slots {
-        return slots;
-    }
-    if let Some(mib) = scene.memory.spare_mib {
-        let slot_bytes = VOXELS.brick_bytes + channels.iter().map(|c| c.brick_bytes).sum::<usize>();
-        return ((mib << 20) as usize / slot_bytes).max(8);
-    }
-    ((readers + 1) * largest_dirty_set(scene, grid, layout)).min((readers + 1) * layout.count())
-}
-
 /// Bricks that one push can rewrite at most: those that an octahedron of radius m / o touches (its volume is a sixth of its box's),
 /// grown by half a brick and the apron on every side.
 fn largest_dirty_set(scene: &Scene, grid: &Grid, layout: &BrickLayout) -> usize {
@@ -236,8 +256,8 @@ mod tests {
         let scene = parse("[console]\nenabled = false\n[effects]\nsections = true");
         let plan = plan(&scene, &grid(), TWO);
         assert_eq!(plan.processes.iter().map(|p| p.process).collect::<Vec<_>>(), [Process::Rendering]);
-        assert_eq!(plan.segments.iter().map(|s| s.name).collect::<Vec<_>>(), ["control", "voxels"]);
-        assert_eq!((plan.bricks, plan.spare_slots), (7 * 6 * 3, 0));
+        assert_eq!(plan.segments.iter().map(|s| s.name).collect::<Vec<_>>(), ["control", "rest"]);
+        assert_eq!((plan.bricks, plan.version_slots), (7 * 6 * 3, 0));
         assert_eq!(plan.segments[1].bytes, (plan.bricks * size_of::<Brick>()) as u64);
         assert!(plan.knobs.iter().all(|(k, _)| k.effect == "view"), "no knob of what is not there");
         assert!(!plan.has_displacement());
@@ -263,12 +283,12 @@ mod tests {
         let plan = plan(&scene, &grid(), TWO);
         let displacement = plan.segments.iter().find(|s| s.name == "displacement").unwrap();
         assert_eq!(displacement.bytes, (displacement.slots * 3 * 4 * EDGE.pow(3)) as u64);
-        assert_eq!(displacement.slots, plan.bricks + plan.spare_slots);
-        assert!(plan.spare_slots >= 2 * (plan.readers + 1));
-        assert!(plan.spare_slots <= (plan.readers + 1) * plan.bricks);
+        assert_eq!(displacement.slots, plan.bricks + 2 * plan.dirty_bricks);
+        assert!((1..=plan.bricks).contains(&plan.dirty_bricks));
+        assert_eq!(plan.version_slots, plan.bricks + (plan.readers + 1) * plan.dirty_bricks);
         let mut small = scene.clone();
         small.memory.spare_slots = Some(17);
-        assert_eq!(super::plan(&small, &grid(), TWO).spare_slots, 17);
+        assert_eq!(super::plan(&small, &grid(), TWO).version_slots, 17);
     }
 
     #[test]

@@ -64,7 +64,7 @@ impl Scene {
             let point =
                 |p: &Waypoint| PathPoint { time_s: p.time_s, mm: Some(p.position_mm), fraction: None, direction: Some(p.direction) };
             tool.path = way.points().iter().map(point).collect();
-            (tool.looped, tool.period_s, tool.approach) = (way.is_looped(), None, None);
+            (tool.looped, tool.period_s, tool.approach, tool.elsewhere) = (way.is_looped(), None, None, None);
         }
     }
 

@@ -194,14 +194,16 @@ impl Scene {
     }
 
     /// Puts another volume in, as `--volume` does. Way points and eye in the scene's own millimetres mean nothing in
-    /// it: where the scene has an approach, it takes the way points' place, and the camera frames the new box.
+    /// it: where the scene has an approach (`elsewhere`, else `approach`), it takes the way points' place, and the camera
+    /// frames the new box.
     pub fn replace_volume(&mut self, file: PathBuf) {
         self.volume.file = Some(file);
         self.volume.phantom = None;
-        if let Some(tool) = &mut self.tool
-            && tool.approach.is_some()
-        {
-            tool.path.clear();
+        if let Some(tool) = &mut self.tool {
+            tool.approach = tool.elsewhere.take().or(tool.approach.take());
+            if tool.approach.is_some() {
+                tool.path.clear();
+            }
         }
         self.rendering.eye = None;
         self.rendering.target = None;
@@ -209,6 +211,9 @@ impl Scene {
 
     /// The scene as TOML, every field written out: what the supervisor hands to the services.
     pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("a scene holds nothing that TOML cannot say: strings, numbers, tables")
+        let mut scene = self.clone();
+        // TOML is UTF-8 and a Linux path need not be; the services read the store, never this file
+        scene.volume.file = scene.volume.file.map(|f| f.to_string_lossy().into_owned().into());
+        toml::to_string(&scene).expect("a scene holds nothing that TOML cannot say: strings, numbers, tables")
     }
 }

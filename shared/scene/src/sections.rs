@@ -155,7 +155,7 @@ pub struct Rendering {
     pub rate_hz: f64,
     /// what the 3D view shows
     pub mode: Mode,
-    /// preset (`ct`, `bone`, `soft`, `lung`) or a file with a transfer function
+    /// preset (`ct`, `bone`, `soft-tissue`, `lung`, `skin`) or a file with a transfer function
     pub transfer: String,
     /// where it is seen from
     pub camera: CameraKind,

@@ -85,9 +85,12 @@ pub struct Tool {
     /// way points, times increasing; for the scene's own volume
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub path: Vec<PathPoint>,
-    /// a press found on the volume itself; used when there are no way points, and when `--volume` puts another volume in
+    /// a press found on the volume itself; used when there are no way points
     #[serde(skip_serializing_if = "Option::is_none")]
     pub approach: Option<Approach>,
+    /// the approach when `--volume` puts another patient in, whose nose is elsewhere; by default `approach`
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub elsewhere: Option<Approach>,
     /// the simulated hand of device `"sim"`
     pub hand: Hand,
 }
@@ -102,6 +105,7 @@ impl Default for Tool {
             period_s: None,
             path: Vec::new(),
             approach: None,
+            elsewhere: None,
             hand: Hand::default(),
         }
     }

@@ -1,0 +1,141 @@
+//! Every fault of a scene is refused on its line, with what was probably meant.
+
+use maille_scene::{Scene, SceneError};
+use std::fs;
+
+fn fault(text: &str) -> SceneError {
+    Scene::parse("scene.toml", text).expect_err("this scene has a fault")
+}
+
+#[test]
+fn an_unknown_key_is_marked_and_the_nearest_key_is_suggested() {
+    let error = fault("name = \"x\"\n\n[deformation]\noffset = 0.2\ntreshold_hu = -300\n");
+    assert_eq!(error.to_string(), "scene.toml:5: unknown key `treshold_hu`, did you mean `threshold_hu`?");
+    assert_eq!(error.marked(), Some("treshold_hu"));
+    let error = fault("[tool.approach]\nperiod = 3");
+    assert!(error.to_string().contains("scene.toml:2") && error.to_string().contains("did you mean `period_s`?"), "{error}");
+    let error = fault("[[tool.path]]\ntimes = 0.0");
+    assert!(error.to_string().contains("unknown key `times`, did you mean `time_s`?"), "{error}");
+    let error = fault("[rendring]\n");
+    assert!(error.to_string().contains("unknown key `rendring`, did you mean `rendering`?"), "{error}");
+}
+
+#[test]
+fn an_unknown_word_is_answered_with_the_words_there_are() {
+    let error = fault("accuracy = \"drafty\"");
+    assert_eq!(error.to_string(), "scene.toml:1: unknown word `drafty`, did you mean `draft`?");
+    assert_eq!(error.marked(), Some("\"drafty\""));
+    let error = fault("[volume]\nphantom = \"foot\"");
+    assert!(error.to_string().contains("`head`") && error.to_string().contains("`torso`"), "{error}");
+    let error = fault("[tool]\ndevice = \"simm\"\n[tool.approach]");
+    assert!(error.to_string().contains("did you mean `sim`?"), "{error}");
+    let error = fault("[tool]\ndevice = \"inverse3\"\n[tool.approach]");
+    assert!(error.to_string().contains("not built yet"), "{error}");
+}
+
+#[test]
+fn a_number_out_of_range_is_marked_with_the_range_that_is_allowed() {
+    let error = fault("[deformation]\noffset = 1.5");
+    assert_eq!(error.to_string(), "scene.toml:2: offset = 1.5 is out of range");
+    assert_eq!(error.marked(), Some("1.5"));
+    assert_eq!(error.advice(), Some("use a number from 0.01 to 0.99"));
+    for text in ["nan", "-inf", "1e300", "-1"] {
+        let error = fault(&format!("[haptic]\nmax_force_n = {text}"));
+        assert_eq!(error.marked(), Some(text));
+    }
+    let error = fault("[volume]\nsize = [256, 4, 256]");
+    assert_eq!(error.marked(), Some("4"));
+    let error = fault("[[tissue]]\nname = \"a\"\nhu = [0, 100]\n[[tissue]]\nname = \"b\"\nhu = [50, 200]");
+    assert!(error.to_string().starts_with("scene.toml:6: tissue `b` begins at 50 HU"), "{error}");
+}
+
+#[test]
+fn every_limit_refuses_what_lies_beyond_both_its_ends() {
+    for limit in maille_scene::limits::LIMITS {
+        let (section, key) = limit.path.split_once('.').unwrap();
+        let tool = if section == "tool" { "" } else { "[tool]\n[tool.approach]\n" };
+        let approach = if section == "tool" { "[tool.approach]\n" } else { "" };
+        for beyond in [limit.low - 1.0, limit.high + 1.0] {
+            let error = fault(&format!("{tool}[{section}]\n{key} = {beyond}\n{approach}"));
+            assert_eq!(error.marked(), Some(format!("{beyond}").as_str()), "{}: {error}", limit.path);
+        }
+        for allowed in [limit.low, limit.high] {
+            // at an end of its range a value may still disagree with another one: then the fault says so, and names no range
+            let text = format!("{tool}[{section}]\n{key} = {allowed}\n{approach}");
+            if let Err(error) = Scene::parse("scene.toml", &text) {
+                assert!(!error.to_string().contains("out of range"), "{}: {error}", limit.path);
+            }
+        }
+    }
+}
+
+#[test]
+fn all_faults_of_a_scene_are_told_at_once() {
+    let error = fault("[deformation]\noffset = 2\n[haptic]\nrate_hz = 5\n[rendering]\nstep = 0");
+    assert_eq!(error.others().len(), 2);
+}
+
+#[test]
+fn effects_are_known_available_and_not_alone() {
+    let error = fault("[effects]\nsection = true");
+    assert_eq!(error.to_string(), "scene.toml:2: unknown effect `section`, did you mean `sections`?");
+    let error = fault("[effects]\nneedle = true");
+    assert!(error.to_string().contains("declared for later and not built yet"), "{error}");
+    let error = fault("[effects]\ndeformation = true");
+    assert!(error.to_string().contains("needs `contact`"), "{error}");
+    assert_eq!(error.advice(), Some("add a [tool] table, or set `deformation = false`"));
+    let error = fault("[effects]\nsections = { enabled = true, size = 3 }");
+    assert!(error.to_string().contains("unknown key `size`"), "{error}");
+    let scene = Scene::parse("ok", "[effects]\nneedle = false\nsections = { enabled = false }").unwrap();
+    assert!(!scene.has_effect("needle") && !scene.has_effect("sections"));
+}
+
+#[test]
+fn way_points_have_one_place_each_and_times_that_increase() {
+    let error = fault("[[tool.path]]\ntime_s = 0\nmm = [0, 0, 0]\nfraction = [0, 0, 0]");
+    assert!(error.to_string().contains("exactly one of `mm` and `fraction`"), "{error}");
+    let error = fault("[[tool.path]]\ntime_s = 1\nmm = [0, 0, 0]\n[[tool.path]]\ntime_s = 1\nmm = [1, 0, 0]");
+    assert!(error.to_string().starts_with("scene.toml:5: way point 2 is at 1 s"), "{error}");
+    let error = fault("[[tool.path]]\ntime_s = 0\nmm = [0, nan, 0]");
+    assert!(error.to_string().contains("is not a point"), "{error}");
+    let error = fault("[tool]\nradius_mm = 2");
+    assert!(error.to_string().contains("no way to go"), "{error}");
+}
+
+#[test]
+fn broken_toml_is_refused_where_it_breaks() {
+    let error = fault("name = \"x\"\n[deformation\noffset = 0.2");
+    assert!(error.to_string().starts_with("scene.toml:2:"), "{error}");
+    let error = fault("[deformation]\noffset = \"soft\"");
+    assert_eq!(error.marked(), Some("\"soft\""));
+}
+
+#[test]
+fn files_are_looked_up_beside_the_scene_and_a_missing_one_points_at_its_line() {
+    let folder = std::env::temp_dir().join(format!("maille-scene-{}", std::process::id()));
+    fs::create_dir_all(&folder).unwrap();
+    let scene = folder.join("scene.toml");
+    fs::write(folder.join("patient.nrrd"), "").unwrap();
+    fs::write(&scene, "[volume]\nfile = \"patient.nrrd\"\n").unwrap();
+    assert_eq!(Scene::load(&scene).unwrap().volume.file, Some(folder.join("patient.nrrd")));
+
+    fs::write(&scene, "[volume]\nfile = \"pateint.nrrd\"\n").unwrap();
+    let error = Scene::load(&scene).unwrap_err();
+    assert!(error.to_string().ends_with("scene.toml:2: there is no volume file pateint.nrrd"), "{error}");
+    assert_eq!(error.marked(), Some("\"pateint.nrrd\""));
+    assert!(error.advice().unwrap().contains("did you mean `patient.nrrd`?"));
+    // with another volume put in, the scene's own is not looked for
+    let patient = folder.join("patient.nrrd");
+    assert_eq!(Scene::open(Some(&scene), Some(&patient)).unwrap().volume.file, Some(patient));
+
+    fs::write(&scene, "[rendering]\ntransfer = \"bnoe\"\n").unwrap();
+    let error = Scene::load(&scene).unwrap_err();
+    assert!(error.advice().unwrap().contains("did you mean `bone`?"), "{error} {:?}", error.advice());
+
+    fs::write(folder.join("way.toml"), "loop = true\n[[path]]\ntime_s = 0\nmm = [1, 2, 3]\n").unwrap();
+    fs::write(&scene, "[tool]\ndevice = \"path:way.toml\"\n[tool.approach]\n").unwrap();
+    let tool = Scene::load(&scene).unwrap().tool.unwrap();
+    assert_eq!(tool.path[0].mm, Some([1.0, 2.0, 3.0]));
+    assert!(Scene::load(folder.join("none.toml")).unwrap_err().to_string().contains("cannot read the scene"));
+    fs::remove_dir_all(&folder).unwrap();
+}
