@@ -106,7 +106,10 @@ fn skull(parts: &mut Parts) {
         (d - 4.6).max(1.9 - d).max(2.0 - foramen(&at.p)).max(outer(at) + 6.5)
     });
     parts.add(Label::Fluid, [-70.0, -70.0, -60.0], [70.0, 105.0, 102.0], 1.5, cavity);
-    // petrous bone and mastoid with the ear's canal
+}
+
+/// Petrous bone and mastoid with the ear's canal; they reach into the cranial cavity, so they come after the brain.
+fn temporal_bones(parts: &mut Parts) {
     let mastoid = |p: &V| ellipsoid(p, v(56.0, 20.0, -24.0), v(13.0, 16.0, 17.0));
     parts.add_pair(Label::Bone, [42.0, 3.0, -42.0], [70.0, 37.0, -6.0], 2.0, mastoid);
     parts.add_pair(Label::SpongyBone, [42.0, 3.0, -42.0], [70.0, 37.0, -6.0], 2.0, move |p| mastoid(p) + 2.0);

@@ -210,7 +210,7 @@ impl Extraction<'_> {
                 break;
             }
             let in_slice = self.layer(k, first, &mut numbers, &mut out);
-            let (below, above) = (k % 2 ^ k0 % 2, (k + 1) % 2 ^ k0 % 2);
+            let (below, above) = ((k - k0) % 2, (k - k0 + 1) % 2);
             debug_assert!(in_slice <= first[k + 1]);
             self.slice(k + 1, first[k + 1], &mut numbers, above, (k + 1 < end).then_some(&mut out));
             self.triangles(k, &numbers, [below, above], &mut triangles);

@@ -107,7 +107,7 @@ fn an_open_surface_ends_at_the_border_only() {
     assert!(sides.values().all(|&n| n == 1));
     let on_border = |vertex: u32| -> [Option<bool>; 3] {
         std::array::from_fn(|c| match mesh.positions[vertex as usize][c] {
-            x if x == 0.0 => Some(false),
+            0.0 => Some(false),
             x if x == (volume.info.grid.size[c] - 1) as f32 => Some(true),
             _ => None,
         })

@@ -87,7 +87,7 @@ impl ScalarFunction for Plane {
 
 impl Torus {
     /// From the nearest point of the core circle to `at`.
-    fn from_core(&self, at: [f64; 3]) -> Vector3<f64> {
+    fn core_offset(&self, at: [f64; 3]) -> Vector3<f64> {
         let d = from(self.center, at);
         let ring = direction(Vector3::new(d.x, d.y, 0.0));
         d - self.major * ring
@@ -96,10 +96,10 @@ impl Torus {
 
 impl ScalarFunction for Torus {
     fn value(&self, at: [f64; 3]) -> f64 {
-        self.level + self.slope * (self.minor - self.from_core(at).norm())
+        self.level + self.slope * (self.minor - self.core_offset(at).norm())
     }
     fn gradient(&self, at: [f64; 3]) -> [f64; 3] {
-        (-self.slope * direction(self.from_core(at))).into()
+        (-self.slope * direction(self.core_offset(at))).into()
     }
 }
 

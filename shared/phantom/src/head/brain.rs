@@ -50,6 +50,7 @@ pub(super) fn add(parts: &mut Parts, random: &mut Random) {
     parts.add_cone(Label::WhiteMatter, [0.0, 24.0, -12.0], 11.0, [0.0, 41.0, -44.0], 5.0);
     parts.add_cone(Label::Nerve, [0.0, 41.0, -44.0], 4.8, [0.0, 49.0, -190.0], 4.4);
     parts.add_cone(Label::Fluid, [0.0, 36.0, -2.0], 4.0, [0.0, 37.0, -14.0], 3.0);
+    temporal_bones(parts);
     vessels(parts, random);
 }
 

@@ -104,10 +104,16 @@ fn orbits(parts: &mut Parts) {
     let (low, high) = ([5.0, -82.0, -12.0], [56.0, -17.0, 34.0]);
     // the rim runs back towards the temple
     let rim = |p: &V| (-68.0 + 0.62 * (p.x - 22.0).max(0.0) - p.y) * 0.85;
-    parts.add_pair(Label::Bone, low, high, 1.6, move |p| (hollow(p) - 2.4).max(rim(p)));
-    parts.add_pair(Label::Fat, low, high, 1.6, move |p| {
-        let front = ball(p, v(32.0, -63.0, 11.0), 12.4);
-        hollow(p).max(-76.0 - p.y).min(front).max(rim(p) - 8.0)
+    let (low, high) = ([-high[0], low[1], low[2]], high);
+    // both keep out of the cranial cavity
+    parts.add(Label::Bone, low, high, 1.8, move |at| {
+        let q = fold(&at.p);
+        (hollow(&q) - 2.4).max(rim(&q)).max(1.0 - cavity(at))
+    });
+    parts.add(Label::Fat, low, high, 1.8, move |at| {
+        let q = fold(&at.p);
+        let front = ball(&q, v(32.0, -63.0, 11.0), 12.4);
+        hollow(&q).max(-76.0 - q.y).min(front).max(rim(&q) - 8.0).max(3.0 - cavity(at))
     });
     for side in [-1.0, 1.0] {
         let at = |x: f64, y: f64, z: f64| [side * x, y, z];

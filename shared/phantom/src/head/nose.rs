@@ -40,9 +40,9 @@ fn cavity_of_nose(at: &At) -> f64 {
 /// Adds the nose; the seed bends the septum and sizes the turbinates.
 pub(super) fn add(parts: &mut Parts, random: &mut Random) -> Landmarks {
     let (low, high) = ([-24.0, -95.0, -50.0], [24.0, -1.0, 6.0]);
-    parts.add(Label::Bone, low, high, 2.2, |at| (cavity_of_nose(at) - 3.0).max(-84.0 - at.p.y).max(at.p.y + 19.0));
+    parts.add(Label::Bone, low, high, 2.2, |at| (cavity_of_nose(at) - 3.2).max(-84.0 - at.p.y).max(at.p.y + 19.0));
     sinuses(parts, random);
-    parts.add(Label::Mucosa, low, high, 2.2, |at| (cavity_of_nose(at) - 1.5).max(outer(at) + 2.5));
+    parts.add(Label::Mucosa, low, high, 2.2, |at| (cavity_of_nose(at) - 1.9).max(outer(at) + 2.5));
     parts.add(Label::Air, low, high, 2.2, |at| cavity_of_nose(at).max(outer(at) + 4.0));
     for side in [-1.0, 1.0] {
         turbinates(parts, side, random);
@@ -71,18 +71,20 @@ fn septum(parts: &mut Parts, random: &mut Random) {
         move |at: &At, half: f64| (middle(&at.p).abs() - half).max(cavity_of_nose(at) - 0.6).max(outer(at) + 3.0).max(at.p.y + 24.0);
     parts.add(Label::Mucosa, low, high, 2.2, move |at| sheet(at, SEPTUM));
     parts.add(Label::Cartilage, low, high, 2.2, move |at| sheet(at, 0.8).max(at.p.y + 64.0));
-    parts.add(Label::Bone, low, high, 2.2, move |at| sheet(at, 0.6).max(-64.0 - at.p.y));
+    parts.add(Label::Bone, low, high, 2.2, move |at| sheet(at, 0.45).max(-64.0 - at.p.y));
 }
 
 /// Lower, middle and upper turbinate of one side: a scroll of mucosa over a curled plate of bone, hung from the outer wall.
 fn turbinates(parts: &mut Parts, side: f64, random: &mut Random) {
     let inner = SEPTUM + MEATUS;
-    // (front, back, height, radius, sag)
-    for (front, back, z, radius) in [(-78.0, -30.0, -34.0, 3.9), (-68.0, -31.0, -19.5, 2.9), (-50.0, -33.0, -9.0, 1.9)] {
+    // front, back, height, radius, and how far the scroll hangs down
+    for (front, back, z, radius, drop) in [(-78.0, -30.0, -33.0, 3.6, 3.6), (-68.0, -31.0, -17.5, 2.8, 5.5), (-50.0, -33.0, -7.5, 1.8, 2.5)]
+    {
         let radius = radius * random.between(0.93, 1.0);
         let x = inner + radius + 0.15;
         let (a, b) = (v(side * x, front + radius, z), v(side * x, back - radius, z + 1.5));
-        let (la, lb) = (v(side * (x + 0.6), front + radius, z - 1.5), v(side * (x + 0.6), back - radius, z));
+        let down = v(side * 0.5, 0.0, -drop);
+        let (la, lb) = (a + down + v(0.0, 2.0, 0.0), b + down + v(0.0, -1.0, 0.5));
         let (low, high) = ([side * 12.0 - 9.0, front - 2.0, z - 12.0], [side * 12.0 + 9.0, back + 2.0, z + 12.0]);
         // the plate by which it hangs: from the scroll up and out
         let hang = move |p: &V, half: f64| {
@@ -91,12 +93,12 @@ fn turbinates(parts: &mut Parts, side: f64, random: &mut Random) {
             let along = dx * 0.8 + dz * 0.6;
             across.max(-along).max(along - 13.0).max(front + 2.0 * radius - p.y).max(p.y - back + 2.0 * radius)
         };
-        let scroll = move |p: &V| smooth_min(cone(p, &a, radius, &b, radius * 0.8), cone(p, &la, radius * 0.9, &lb, radius * 0.7), 1.5);
-        parts.add(Label::Mucosa, low, high, 2.2, move |at| smooth_min(scroll(&at.p), hang(&at.p, 1.3), 1.5).max(cavity_of_nose(at) - 0.5));
-        // a shell of thin bone within the scroll, open below
+        let scroll = move |p: &V| smooth_min(cone(p, &a, radius, &b, radius * 0.8), cone(p, &la, radius * 0.9, &lb, radius * 0.7), 3.5);
+        parts.add(Label::Mucosa, low, high, 2.2, move |at| smooth_min(scroll(&at.p), hang(&at.p, 1.5), 1.5).max(cavity_of_nose(at) - 0.5));
+        // a thin plate of bone within, on the side of the wall
         parts.add(Label::Bone, low, high, 2.2, move |at| {
-            let curl = ((scroll(&at.p) + 0.55 * radius).abs() - 0.45).max(z - 1.0 - at.p.z);
-            curl.min(hang(&at.p, 0.4)).max(cavity_of_nose(at) - 0.5)
+            let plate = ((side * at.p.x - x - 0.25 * radius).abs() - 0.4).max(scroll(&at.p) + 0.4 * radius);
+            plate.min(hang(&at.p, 0.4)).max(cavity_of_nose(at) - 0.5)
         });
     }
 }
