@@ -31,10 +31,14 @@
 #![forbid(unsafe_code)]
 
 mod brick;
+mod consistent;
 mod elements;
 mod intersection;
 mod mail;
+mod propagate;
 mod region;
+mod state;
+mod tile;
 mod tissue;
 
 pub use brick::DisplacementBrick;
@@ -42,4 +46,4 @@ pub use elements::{elements_in_sphere, enclosing_elements};
 pub use intersection::intersection_search;
 pub use mail::{ChainMail, Motion, Pin, PushOutcome};
 pub use region::{ChangedBrick, ChangedRegion};
-pub use tissue::{Admission, Tissue};
+pub use tissue::{Admission, ElementLimits, Tissue, link_limit};
