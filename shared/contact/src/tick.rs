@@ -76,6 +76,8 @@ pub struct HapticConfig {
     pub passivity: bool,
     /// α_max of the passivity controller [N·s/mm]
     pub passivity_damping_n_s_per_mm: f64,
+    /// how late the device's poses are [ticks], where it is known; the passivity observer needs it
+    pub pose_delay_ticks: usize,
 }
 
 impl HapticConfig {
@@ -93,6 +95,7 @@ impl HapticConfig {
             friction: true,
             passivity: false,
             passivity_damping_n_s_per_mm: 0.03,
+            pose_delay_ticks: 0,
         }
     }
 }
@@ -210,7 +213,7 @@ impl HapticCore {
         Self {
             proxy: Proxy::new(config.radius_mm),
             friction: Friction::default(),
-            passivity: Passivity::new(5.0, config.passivity_damping_n_s_per_mm),
+            passivity: Passivity::new(5.0, config.passivity_damping_n_s_per_mm, config.pose_delay_ticks),
             shaper: ForceShaper::new(config.limits),
             gate: MoveGate::default(),
             faults: Faults::default(),

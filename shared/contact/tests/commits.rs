@@ -3,7 +3,10 @@
 mod common;
 
 use common::*;
-use maille_contact::{AnalyticSurface, Material, Surface};
+use maille_contact::{
+    AnalyticSurface, Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, Material, SimulatedHand, Surface, TickInputs,
+    TissueTable,
+};
 use maille_volume::VolumeSample;
 
 /// A wall whose surface lies at height `z`.
@@ -110,4 +113,53 @@ fn withdrawn_tissue_forgets() {
     let mut last_force = 0.0;
     press(33, |_, _, out| last_force = out.force_n[2]);
     assert_eq!(last_force, 0.0);
+}
+
+/// The whole play on voxels: a hand presses 6 mm into a wall that answers each move with a chain's dent, a pyramid whose slope is the
+/// link limit (0.2), resampled and committed every 30 ms. The hand feels a growing push, mostly along the wall's normal.
+#[test]
+fn a_hand_that_dents_voxels_feels_a_steady_push() {
+    let limit = 0.2;
+    let mut dents: Vec<(V3, f64)> = Vec::new();
+    let make = |dents: &[(V3, f64)]| {
+        sampled(40, |x| {
+            let depth = dents.iter().map(|(at, depth)| depth - limit * ((x.x - at.x).abs() + (x.y - at.y).abs())).fold(0.0, f64::max);
+            edge(-x.z - depth)
+        })
+    };
+    let (mut volume, mut epoch, mut told) = (make(&dents), 1, None::<maille_contact::ToolMove>);
+    let config = HapticConfig::new(2.0, Coupling::new(2.0, 5e-4, 0.003, 1e-3).unwrap());
+    let mut core = HapticCore::new(HapticConfig { tissue: TissueTable::uniform(Material::SOFT), ..config });
+    let mut hand = SimulatedHand::new(Grip::FULL, [0.3, -0.2, 4.0], [0.0, 0.0, -1.0]);
+    let (mut last, mut last_depth, mut worst, mut deepest) = (V3::zeros(), 0.0f64, 0.0f64, 0.0f64);
+    for n in 0..1500u64 {
+        if n % 30 == 0
+            && let Some(m) = told.take()
+        {
+            let foot = V3::from(m.contact_mm) - V3::from(m.normal) * m.depth_mm;
+            dents.push((foot, -foot.z));
+            volume = make(&dents);
+            epoch += 1;
+        }
+        let z = (4.0 - 0.01 * n as f64).max(-5.0);
+        hand.set_target([0.3, -0.2, z]);
+        let now_ns = n * 1_000_000;
+        let pose = hand.read(now_ns);
+        let tissue = Isosurface::new(&volume, 0.0);
+        let out = core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&tissue), epoch, tissue_age_s: 0.0, release: false });
+        hand.write(out.force_n);
+        told = out.tool_move.or(told);
+        let f = V3::from(out.force_n);
+        worst = worst.max((f - last).norm() / f.norm().max(0.5));
+        deepest = deepest.max(out.indentation_mm);
+        last = f;
+        if out.indentation_mm > 1.0 {
+            assert!(f.xy().norm() < 0.1 * f.z, "{n}: the push is along the wall's normal: {f:?}");
+        }
+        last_depth = out.penetration_mm;
+    }
+    assert!(dents.len() > 15 && deepest > 4.0, "{} commits, {deepest} mm", dents.len());
+    assert!(worst <= 0.05, "worst step {:.1} %", worst * 100.0);
+    // the tip has made its room: what is left is the dent's rounded bottom
+    assert!(last_depth < 0.3, "{last_depth} mm left");
 }

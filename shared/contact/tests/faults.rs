@@ -216,7 +216,7 @@ fn a_simulated_hand_rests_on_a_stiff_wall() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(40))]
+    #![proptest_config(ProptestConfig { cases: 40, failure_persistence: None, ..ProptestConfig::default() })]
     /// Whatever the device says, in whatever tissue, the force is finite, bounded and changes no faster than allowed.
     #[test]
     fn any_motion_in_noise_is_bounded(seed in 0u64..1 << 40, moves in prop::collection::vec(prop::array::uniform3(-4.0..4.0f64), 1..150)) {

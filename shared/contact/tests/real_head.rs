@@ -81,7 +81,9 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64,
 fn sliding_over_skin_and_skull_keeps_contact_and_gives_no_step() {
     let Some(volume) = head() else { return };
     // skin at the nose's height; skull over the forehead, where no orbit opens
-    for (threshold, elevation, grip) in [(-300.0, 0.35, Grip::LIGHT), (-300.0, 0.35, Grip::FULL), (276.0, 1.2, Grip::LIGHT), (276.0, 1.2, Grip::FULL)] {
+    for (threshold, elevation, grip) in
+        [(-300.0, 0.35, Grip::LIGHT), (-300.0, 0.35, Grip::FULL), (276.0, 1.2, Grip::LIGHT), (276.0, 1.2, Grip::FULL)]
+    {
         let (worst, touched) = slide(&volume, threshold, elevation, 3.0, grip);
         assert!(touched > 0.9, "threshold {threshold}: {:.0} % of ticks in contact", touched * 100.0);
         assert!(worst <= 0.05, "threshold {threshold}: worst step {:.1} %", worst * 100.0);

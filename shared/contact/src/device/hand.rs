@@ -1,7 +1,9 @@
 //! A simulated hand that holds a device: it wants the tip somewhere and yields to force.
 //!
-//! m a = k (x_target − x) + c (v_target − v) − b v + F,   semi-implicit Euler with steps of at most 0.25 ms; F is the force last
-//! written, held between ticks, as a device does. k and c are the hand's grip, b the device's own damping.
+//! m a = k (x_target − x) + c (v_target − v) − b v + F,   by the implicit midpoint rule with steps of at most 0.25 ms; F is the force
+//! last written, held between ticks, as a device does. k and c are the hand's grip, b the device's own damping. The rule
+//! conserves a spring's energy and is stable for any gains: a rule that damped or fed the hand would pass for the
+//! loop's own stability (semi-implicit Euler shifts the stable stiffness by a quarter at these steps).
 //!
 //! The pose that is read may be quantised (encoder) and late by whole ticks (transport); the true position is
 //! [`SimulatedHand::true_position_mm`], for energy balances. Units: mm, N, s, mass kg (a [mm/s²] = 1000 F [N] / m [kg]).
@@ -132,19 +134,20 @@ impl SimulatedHand {
             (goal, self.direction) = (V3::from(position), V3::from(direction));
         }
         let target_velocity = (goal - start) / duration;
+        let a = per_mass * dt;
+        let half = 0.5 * a * (g.damping_n_s_per_mm + g.device_damping_n_s_per_mm) + 0.25 * a * dt * g.stiffness_n_per_mm;
         for n in 0..steps {
-            let target = start + target_velocity * (dt * (n + 1) as f64);
+            let target = start + target_velocity * (dt * (n as f64 + 0.5));
             let pull = (target - self.position) * g.stiffness_n_per_mm + target_velocity * g.damping_n_s_per_mm + self.force;
-            // damping implicitly: stable for any damping
-            let damping = (g.damping_n_s_per_mm + g.device_damping_n_s_per_mm) * per_mass * dt;
-            let mut velocity = (self.velocity + pull * (per_mass * dt)) / (1.0 + damping);
+            let before = self.velocity;
+            let mut velocity = (before * (1.0 - half) + pull * a) / (1.0 + half);
             // Coulomb friction takes speed, at most all of it
             let speed = velocity.norm();
             if g.coulomb_n > 0.0 && speed > 0.0 {
                 velocity *= (1.0 - g.coulomb_n * per_mass * dt / speed).max(0.0);
             }
             self.velocity = velocity;
-            self.position += velocity * dt;
+            self.position += (before + velocity) * (0.5 * dt);
         }
         self.target = goal;
     }
