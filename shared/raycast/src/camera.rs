@@ -23,10 +23,14 @@ pub struct Camera {
 impl Camera {
     /// A camera in front of the patient (anterior, head up) that sees the whole volume.
     pub fn around(info: &VolumeInfo) -> Self {
+        Self::in_front(info, 30.0)
+    }
+
+    /// The same with another field of view [degrees]: the eye stands where the sphere around the volume fills it.
+    pub fn in_front(info: &VolumeInfo, fov_deg: f64) -> Self {
         let center = Vector3::from(info.grid.center());
         let corner = Vector3::from(info.grid.world_from_index([0.0; 3]));
         let radius = (corner - center).norm().max(info.grid.min_spacing());
-        let fov_deg: f64 = 30.0;
         let distance = radius / (fov_deg.to_radians() / 2.0).sin();
         Self { eye: (center - Vector3::y() * distance).into(), target: center.into(), up: [0.0, 0.0, 1.0], fov_deg }
     }

@@ -12,8 +12,6 @@ use crate::{
 use maille_volume::VolumeInfo;
 use nalgebra::{Matrix3, Vector3};
 
-/// Light left at which a ray stops. What is left is taken to look like what was seen so far, so the error is far below it.
-pub const OPAQUE: f32 = 0.015;
 /// Refinements of a hit inside its step.
 pub const REFINEMENTS: usize = 4;
 /// Directions smaller than this [index per mm] count as this: slabs are then divided by a number.
@@ -34,6 +32,8 @@ pub struct Frame {
     pub shift: [f32; 2],
     /// distance between samples [mm]
     pub step: f32,
+    /// light left at which a ray stops
+    pub opaque: f32,
     /// index of the last voxel
     pub last: [f32; 3],
     /// lower corner of the last trilinear cell
@@ -99,6 +99,7 @@ impl Frame {
             scale: [2.0 / width as f32, 2.0 / height as f32],
             shift: [1.0 / width as f32 - 1.0, 1.0 / height as f32 - 1.0],
             step: step as f32,
+            opaque: (1.0 - settings.opacity_end) as f32,
             last: grid.size.map(|s| (s - 1) as f32),
             last_cell: grid.size.map(|s| s.saturating_sub(2) as i32),
             value_scale: value_scale as f32,

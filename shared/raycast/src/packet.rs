@@ -11,7 +11,7 @@
 #![allow(unsafe_code)]
 
 use crate::{
-    frame::{Frame, OPAQUE, REFINEMENTS},
+    frame::{Frame, REFINEMENTS},
     scalar::{Seen, ZERO_GRADIENT},
     settings::Mode,
     skip::Skip,
@@ -180,8 +180,8 @@ impl Rays {
         let u = _mm256_fmadd_ps(column, set(frame.scale[0]), set(frame.shift[0]));
         let v = _mm256_fmadd_ps(row, set(frame.scale[1]), set(frame.shift[1]));
         let mut direction = [set(0.0); 3];
-        for c in 0..3 {
-            direction[c] = _mm256_fmadd_ps(v, set(frame.down[c]), _mm256_fmadd_ps(u, set(frame.right[c]), set(frame.forward[c])));
+        for (c, d) in direction.iter_mut().enumerate() {
+            *d = _mm256_fmadd_ps(v, set(frame.down[c]), _mm256_fmadd_ps(u, set(frame.right[c]), set(frame.forward[c])));
         }
         let inverse_length = _mm256_div_ps(set(1.0), _mm256_sqrt_ps(dot(&direction, &direction)));
         let (mut enter, mut leave) = (set(0.0), set(f32::INFINITY));
@@ -375,8 +375,10 @@ fn look_up(frame: &Frame, value: __m256) -> [__m256; 4] {
     let last = _mm256_set1_epi32(entries.len() as i32 - 1);
     let index = integers(_mm256_max_epi32(_mm256_min_epi32(_mm256_cvttps_epi32(value), last), _mm256_setzero_si256()));
     let entry = |n: usize| {
-        // SAFETY: the index was clamped to the table's, and an entry is 16 bytes; the load needs no alignment.
-        unsafe { _mm_loadu_ps(entries.get_unchecked(index[n] as usize).as_ptr()) }
+        // SAFETY: the index was clamped to the table's.
+        let entry = unsafe { entries.get_unchecked(index[n] as usize) };
+        // SAFETY: an entry is 16 bytes; the load needs no alignment.
+        unsafe { _mm_loadu_ps(entry.as_ptr()) }
     };
     let two = |n: usize| _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(entry(n)), entry(n + 4));
     let (a, b, c, d) = (two(0), two(1), two(2), two(3));
@@ -504,7 +506,7 @@ fn cast<S: BrickSource + ?Sized>(frame: &Frame, source: &S, skip: &Skip, x: usiz
                     _mm256_andnot_ps(_mm256_cmp_ps::<_CMP_LT_OQ>(transmittance, set(0.5)), _mm256_cmp_ps::<_CMP_LT_OQ>(left, set(0.5)));
                 depth = _mm256_blendv_ps(depth, distance, half);
                 transmittance = left;
-                alive = _mm256_and_ps(alive, _mm256_cmp_ps::<_CMP_GE_OQ>(left, set(OPAQUE)));
+                alive = _mm256_and_ps(alive, _mm256_cmp_ps::<_CMP_GE_OQ>(left, set(frame.opaque)));
             }
             Mode::Isosurface { threshold_hu, color: surface } => {
                 let threshold = set(threshold_hu as f32);
@@ -544,7 +546,7 @@ fn cast<S: BrickSource + ?Sized>(frame: &Frame, source: &S, skip: &Skip, x: usiz
     }
     let mut seen = Seen8 { color: color.map(|c| floats(c)), transmittance: floats(transmittance), depth: floats(depth) };
     match frame.mode {
-        Mode::Volume => seen.saturate(),
+        Mode::Volume => seen.saturate(frame.opaque),
         Mode::Isosurface { .. } => {}
         Mode::Xray { .. } => seen.transmit(&floats(attenuation)),
     }
@@ -553,9 +555,9 @@ fn cast<S: BrickSource + ?Sized>(frame: &Frame, source: &S, skip: &Skip, x: usiz
 
 impl Seen8 {
     /// What is left behind an opaque ray is taken to look like what was seen.
-    fn saturate(&mut self) {
+    fn saturate(&mut self, opaque: f32) {
         for n in 0..LANES {
-            if self.transmittance[n] < OPAQUE {
+            if self.transmittance[n] < opaque {
                 let whole = 1.0 / (1.0 - self.transmittance[n]);
                 self.color.iter_mut().for_each(|c| c[n] *= whole);
                 self.transmittance[n] = 0.0;

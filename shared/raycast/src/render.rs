@@ -128,6 +128,9 @@ fn check<S: BrickSource + ?Sized>(
     if !(step.is_finite() && step > 0.0) {
         return Err(RenderError::Settings(format!("a step of {step} mm is not positive and finite")));
     }
+    if !(0.5..=1.0).contains(&settings.opacity_end) {
+        return Err(RenderError::Settings(format!("rays that end at an opacity of {}: it must be 0.5 to 1", settings.opacity_end)));
+    }
     if let Mode::Isosurface { threshold_hu: v, .. } | Mode::Xray { water_per_mm: v } = settings.mode
         && !v.is_finite()
     {

@@ -5,7 +5,7 @@
 //! [`packet`](crate::packet).
 
 use crate::{
-    frame::{Frame, OPAQUE, REFINEMENTS, Ray},
+    frame::{Frame, REFINEMENTS, Ray},
     settings::Mode,
     skip::Skip,
 };
@@ -62,7 +62,7 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
                             seen.depth = ray.start + k * f.step;
                         }
                         seen.transmittance = left;
-                        if left < OPAQUE {
+                        if left < f.opaque {
                             let whole = 1.0 / (1.0 - left);
                             seen.color = seen.color.map(|c| c * whole);
                             seen.transmittance = 0.0;

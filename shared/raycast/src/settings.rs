@@ -89,6 +89,9 @@ pub struct Settings {
     pub shading: Option<Shading>,
     /// distance between samples
     pub step: Step,
+    /// share of the light used up at which a ray ends (volume mode), 0.5 to 1; what is left is taken to look like what was
+    /// seen so far, so the error is a small part of it
+    pub opacity_end: f64,
     /// colour where nothing is
     pub background: [f32; 3],
 }
@@ -104,7 +107,7 @@ impl Settings {
     /// Volume rendering of a transfer function, with its own shading.
     pub fn volume(transfer: Transfer) -> Self {
         let shading = Some(transfer.shading.unwrap_or_default());
-        Self { mode: Mode::Volume, transfer, shading, step: Step::Voxels(1.0), background: [0.0; 3] }
+        Self { mode: Mode::Volume, transfer, shading, step: Step::Voxels(1.0), opacity_end: 0.985, background: [0.0; 3] }
     }
 
     /// The surface at a value, in the colour of bone.

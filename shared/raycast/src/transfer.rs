@@ -57,7 +57,7 @@ impl Preset {
         match self {
             Self::Ct => "ct",
             Self::Bone => "bone",
-            Self::SoftTissue => "soft-tissue",
+            Self::SoftTissue => "soft",
             Self::Lung => "lung",
             Self::Skin => "skin",
         }
