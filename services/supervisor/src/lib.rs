@@ -1,1 +1,145 @@
-//! Placeholder: replaced by the part's first commit.
+//! The supervisor: makes all shared memory and all services, starts the processes, watches them, restarts them, and
+//! leaves nothing behind.
+//!
+//! ```text
+//! run ─ stale      what dead runs left goes first
+//!     ─ patient    the volume is read or made, with progress
+//!     ─ simulation memory, services and processes come and go together
+//!     ─ watch      one poll over deaths, words, signals and time; restart decides what follows a death
+//!     ─ report     what the run did
+//! ```
+//!
+//! Invariants: only the supervisor creates (DESIGN D5); it waits for no child; a pin is released only after its holder's
+//! death is confirmed (D6); a running simulation of somebody else is never touched; whatever way a run ends but by SIGKILL,
+//! nothing of it is left in /dev/shm and no process of it lives. After a SIGKILL the services end themselves, and the next
+//! run or `maille clean` removes the memory.
+//!
+//! Not here: any simulation, tokio (the console is a process of its own, D13), unsafe code.
+
+#![forbid(unsafe_code)]
+
+pub mod doctor;
+pub mod enter;
+mod error;
+pub mod memory;
+mod patient;
+mod process;
+pub mod report;
+pub mod restart;
+mod signals;
+mod simulation;
+pub mod stale;
+mod watch;
+
+pub use enter::enter;
+pub use error::SupervisorError;
+pub use report::RunReport;
+
+use maille_contract::Role;
+use maille_scene::{Device, Scene};
+use signals::Signals;
+use simulation::Simulation;
+use std::{
+    fs,
+    io::Write as _,
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+/// Prints a line on standard output; a reader that went away is no reason to end a simulation.
+macro_rules! say {
+    ($($word:tt)*) => {
+        $crate::say_line(format_args!($($word)*))
+    };
+}
+pub(crate) use say;
+
+fn say_line(line: std::fmt::Arguments<'_>) {
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+}
+
+/// What to run and how.
+#[derive(Clone, Debug, Default)]
+pub struct RunOptions {
+    /// scene file; none: the built-in scene
+    pub scene: Option<PathBuf>,
+    /// volume in place of the scene's own
+    pub volume: Option<PathBuf>,
+    /// no console
+    pub headless: bool,
+    /// end by itself after this time
+    pub duration: Option<Duration>,
+    /// where to write the report
+    pub report: Option<PathBuf>,
+    /// what moves the tool, in place of the scene's own
+    pub device: Option<Device>,
+    /// roles that a person will start with `maille service`
+    pub by_hand: Vec<Role>,
+}
+
+/// Runs a scene to its end: duration, SIGINT, SIGTERM, SIGHUP, or a service that cannot live. Main thread only: the kernel ends
+/// children with the thread that started them.
+///
+/// # Errors
+/// One sentence, when the run cannot start or go on. Everything is cleaned up by then.
+pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
+    let mut signals = Signals::register().map_err(SupervisorError::io("signals cannot be received"))?;
+    if let Some(path) = &options.report {
+        check_writable(path)?;
+    }
+    let mut scene = Scene::open(options.scene.as_deref(), options.volume.as_deref())?;
+    if let Some(device) = &options.device {
+        scene.use_device(device.clone())?;
+    }
+    scene.console.enabled &= !options.headless;
+    for removed in stale::clean_dead_runs()? {
+        say!("{removed}");
+    }
+
+    let source = scene.volume.source();
+    let names = RunReport { scene: scene.name.clone(), volume: patient::name(&source), ..RunReport::default() };
+    let Some(patient) = patient::load(&source, &mut signals)? else {
+        let ended_by = signals.received().unwrap_or("signal").to_owned();
+        return finish(RunReport { ended_by, ..names }, options);
+    };
+    for notice in &patient.1 {
+        eprintln!("maille: {notice}");
+    }
+    let mut simulation = Simulation::create(scene, &patient, &options.by_hand)?;
+    say!("domain       {}", simulation.domain());
+    drop(patient);
+
+    simulation.begin();
+    for role in &options.by_hand {
+        say!("{:<12} waits for `maille service {} --domain {}`", role.word(), role.word(), simulation.domain());
+    }
+    let outcome = simulation.watch(&mut signals, options.duration);
+    let report = simulation.end(*outcome.as_ref().unwrap_or(&"failure"));
+    drop(simulation);
+    let report = finish(RunReport { scene: names.scene, volume: names.volume, ..report }, options)?;
+    outcome.map(|_| report)
+}
+
+/// Writes and prints the report.
+fn finish(report: RunReport, options: &RunOptions) -> Result<RunReport, SupervisorError> {
+    if let Some(path) = &options.report {
+        let mut text = serde_json::to_string_pretty(&report).expect("a report is strings and finite numbers");
+        text.push('\n');
+        fs::write(path, text).map_err(|source| SupervisorError::Report { path: path.clone(), source })?;
+    }
+    if !report.services.is_empty() {
+        say!("{report}");
+    }
+    Ok(report)
+}
+
+/// Finds out at the start, not after an hour's run, that a report has no place to go.
+fn check_writable(path: &Path) -> Result<(), SupervisorError> {
+    let existed = path.exists();
+    let opened = fs::OpenOptions::new().create(true).append(true).open(path);
+    if !existed && opened.is_ok() {
+        let _ = fs::remove_file(path);
+    }
+    opened.map(drop).map_err(|source| SupervisorError::Report { path: path.to_path_buf(), source })
+}

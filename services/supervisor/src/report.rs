@@ -1,0 +1,295 @@
+//! The report of a run: `--report run.json` and the table at its end.
+//!
+//! Numbers come from the control block, where services count and where counts stand through their deaths, and from /proc
+//! for memory. The services leave their first second out (warm-up). The keys are DESIGN section 10's and stay what they
+//! are; further keys may come. Rates [Hz], durations [µs] or [ms] as the key says, memory [MiB = 2²⁰ bytes].
+//!
+//! | key | meaning |
+//! |---|---|
+//! | `scene`, `domain`, `volume` | names of the scene, the domain, the patient |
+//! | `duration_s` | from the start of the services to the end |
+//! | `ended_by` | `duration`, a signal's name, or `failure` |
+//! | `services.S.pid` | process id of the last process of the service |
+//! | `services.S.restarts` | starts after the first |
+//! | `services.S.private_mib`, `private_peak_mib` | `Private_Dirty` shortly before the end, and the most seen |
+//! | `services.S.stalls` | times without a heartbeat for 0.5 s |
+//! | `services.S.killed` | it did not end within 1 s when asked |
+//! | `services.haptic.rate_hz`, `overruns` | ticks a second after warm-up; releases missed and not caught up |
+//! | `services.haptic.tick_us`, `lateness_us` | compute of a tick; how late it began: `p50`, `p99`, `p999`, `max` |
+//! | `services.haptic.in_contact`, `degraded`, `allocations`, `realtime` | ticks in contact; ticks in a fallback; allocations in ticks; whether real-time rights were had |
+//! | `services.deformation.commits`, `moved_elements` | transactions; elements moved, summed over them |
+//! | `services.deformation.step_us` | from a tool move to its commit |
+//! | `services.deformation.tool_moves`, `deferred`, `refused`, `inversion_failures` | moves received; commits put off for want of a slot; messages that could not be used; voxels given their nearest answer |
+//! | `services.rendering.frames`, `rate_hz`, `frame_ms` | frames after warm-up; a second; time of one |
+//! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
+//! | `store.segment_mib` | all segments of the run in /dev/shm |
+//! | `store.segments_mib` | the same by segment |
+//! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
+
+use crate::{memory::MIB, watch::Post};
+use maille_contract::{
+    ControlBlock, Role, ServiceCell,
+    control::Counter,
+    histogram::{Percentiles, SharedHistogram},
+};
+use serde::Serialize;
+use std::{collections::BTreeMap, fmt, sync::atomic::Ordering::Relaxed};
+
+/// Percentiles of a duration, in the unit that the key names.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Durations {
+    /// median
+    pub p50: f64,
+    /// 99th percentile
+    pub p99: f64,
+    /// 99.9th percentile
+    pub p999: f64,
+    /// largest
+    pub max: f64,
+}
+
+impl Durations {
+    fn of(histogram: &SharedHistogram, unit_ns: f64) -> Self {
+        let Percentiles { p50, p99, p999, max, .. } = histogram.percentiles();
+        Self { p50: p50 / unit_ns, p99: p99 / unit_ns, p999: p999 / unit_ns, max: max / unit_ns }
+    }
+}
+
+/// Of the haptic process.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct HapticReport {
+    pub rate_hz: f64,
+    pub overruns: u64,
+    pub tick_us: Durations,
+    pub lateness_us: Durations,
+    pub in_contact: u64,
+    pub degraded: u64,
+    pub allocations: u64,
+    pub realtime: bool,
+}
+
+/// Of the deformation process.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct DeformationReport {
+    pub commits: u64,
+    pub moved_elements: u64,
+    pub step_us: Durations,
+    pub tool_moves: u64,
+    pub deferred: u64,
+    pub refused: u64,
+    pub inversion_failures: u64,
+}
+
+/// Of the rendering process.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct RenderingReport {
+    pub frames: u64,
+    pub rate_hz: f64,
+    pub frame_ms: Durations,
+}
+
+/// What only one kind of service has.
+#[derive(Clone, Debug, Serialize)]
+#[serde(untagged)]
+#[allow(missing_docs)] // the names are the roles
+pub enum Own {
+    Haptic(HapticReport),
+    Deformation(DeformationReport),
+    Rendering(RenderingReport),
+    Console {},
+}
+
+/// Of one service.
+#[derive(Clone, Debug, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct ServiceReport {
+    pub pid: u64,
+    pub restarts: u64,
+    pub private_mib: f64,
+    pub private_peak_mib: f64,
+    pub stalls: u64,
+    pub killed: bool,
+    #[serde(flatten)]
+    pub own: Own,
+}
+
+/// Of the store.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct StoreReport {
+    pub voxels_mib: f64,
+    pub segment_mib: f64,
+    pub segments_mib: BTreeMap<String, f64>,
+    pub spare_slots: u64,
+    pub spare_slots_low: Option<u64>,
+}
+
+/// What a run did.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct RunReport {
+    pub scene: String,
+    pub domain: String,
+    pub volume: String,
+    pub duration_s: f64,
+    pub ended_by: String,
+    pub services: BTreeMap<String, ServiceReport>,
+    pub store: StoreReport,
+}
+
+impl ServiceReport {
+    /// The numbers of one post.
+    pub(crate) fn of(control: &ControlBlock, post: &Post, killed: bool) -> Self {
+        let cell = control.service(post.role);
+        Self {
+            pid: cell.pid.load(Relaxed),
+            restarts: cell.restarts.load(Relaxed),
+            private_mib: post.private_mib.unwrap_or(0.0),
+            private_peak_mib: post.private_peak_mib,
+            stalls: post.stalls,
+            killed,
+            own: own(post.role, cell),
+        }
+    }
+}
+
+fn own(role: Role, cell: &ServiceCell) -> Own {
+    let n = |counter| cell.counter(counter);
+    let seconds = n(Counter::RecordedNs) as f64 * 1e-9;
+    let rate_hz = if seconds > 0.0 { n(Counter::Iterations) as f64 / seconds } else { 0.0 };
+    match role {
+        Role::Haptic => Own::Haptic(HapticReport {
+            rate_hz,
+            overruns: n(Counter::Overruns),
+            tick_us: Durations::of(&cell.duration, 1e3),
+            lateness_us: Durations::of(&cell.lateness, 1e3),
+            in_contact: n(Counter::InContact),
+            degraded: n(Counter::Degraded),
+            allocations: n(Counter::Allocations),
+            realtime: n(Counter::NotRealtime) == 0,
+        }),
+        Role::Deformation => Own::Deformation(DeformationReport {
+            commits: n(Counter::Commits),
+            moved_elements: n(Counter::MovedElements),
+            step_us: Durations::of(&cell.duration, 1e3),
+            tool_moves: n(Counter::Received),
+            deferred: n(Counter::Deferred),
+            refused: n(Counter::Refused),
+            inversion_failures: n(Counter::Failures),
+        }),
+        Role::Rendering => {
+            Own::Rendering(RenderingReport { frames: n(Counter::Iterations), rate_hz, frame_ms: Durations::of(&cell.duration, 1e6) })
+        }
+        Role::Console => Own::Console {},
+    }
+}
+
+impl StoreReport {
+    /// The numbers of the store. `spare_slots_low` is a word that its writer has not lowered yet while it is all ones.
+    pub(crate) fn of(voxels: usize, segments: &[(String, u64)], spare_slots: u64, spare_slots_low: u64) -> Self {
+        let segments_mib: BTreeMap<_, _> = segments.iter().map(|(name, bytes)| (name.clone(), *bytes as f64 / MIB)).collect();
+        Self {
+            voxels_mib: 2.0 * voxels as f64 / MIB,
+            segment_mib: segments_mib.values().sum(),
+            segments_mib,
+            spare_slots,
+            spare_slots_low: (spare_slots_low != u64::MAX).then_some(spare_slots_low),
+        }
+    }
+}
+
+/// The table that a person reads at the end.
+impl fmt::Display for RunReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let row = |d: &Durations| format!("{:>9.1} {:>9.1} {:>9.1} {:>9.1}", d.p50, d.p99, d.p999, d.max);
+        writeln!(f, "\n{} on {}: {:.1} s, ended by {}", self.scene, self.volume, self.duration_s, self.ended_by)?;
+        writeln!(f, "{:<12} {:>8} {:>8} {:>11} {:>10}  ", "service", "pid", "restarts", "private MiB", "rate Hz")?;
+        for (name, s) in &self.services {
+            let (rate, notes) = match &s.own {
+                Own::Haptic(h) => (format!("{:.1}", h.rate_hz), format!("{} overruns, {} ticks in contact", h.overruns, h.in_contact)),
+                Own::Deformation(d) => ("".into(), format!("{} commits, {} elements moved", d.commits, d.moved_elements)),
+                Own::Rendering(r) => (format!("{:.1}", r.rate_hz), format!("{} frames", r.frames)),
+                Own::Console {} => Default::default(),
+            };
+            let killed = if s.killed { ", had to be killed" } else { "" };
+            writeln!(f, "{name:<12} {:>8} {:>8} {:>11.1} {rate:>10}  {notes}{killed}", s.pid, s.restarts, s.private_mib)?;
+        }
+        writeln!(f, "\n{:<24} {:>9} {:>9} {:>9} {:>9}", "time", "p50", "p99", "p99.9", "max")?;
+        for s in self.services.values() {
+            match &s.own {
+                Own::Haptic(h) => {
+                    writeln!(f, "{:<24} {}", "haptic tick µs", row(&h.tick_us))?;
+                    writeln!(f, "{:<24} {}", "haptic lateness µs", row(&h.lateness_us))?;
+                }
+                Own::Deformation(d) => writeln!(f, "{:<24} {}", "deformation step µs", row(&d.step_us))?,
+                Own::Rendering(r) => writeln!(f, "{:<24} {}", "rendering frame ms", row(&r.frame_ms))?,
+                Own::Console {} => {}
+            }
+        }
+        let low = self.store.spare_slots_low.map_or("all".into(), |low| low.to_string());
+        write!(
+            f,
+            "\nstore: {:.1} MiB of voxels, {:.1} MiB of segments, spare slots {}, fewest free {low}",
+            self.store.voxels_mib, self.store.segment_mib, self.store.spare_slots
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::Zeroable as _;
+    use maille_contract::control::ControlBlock;
+
+    fn control() -> Box<ControlBlock> {
+        Box::new(ControlBlock::zeroed())
+    }
+
+    fn report(control: &ControlBlock) -> serde_json::Value {
+        let services = Role::ALL.map(|role| (role.word().to_owned(), ServiceReport::of(control, &Post::new(role, false), false)));
+        let store = StoreReport::of(1 << 20, &[("rest".into(), 3 << 20), ("control".into(), 1 << 20)], 10, u64::MAX);
+        let report = RunReport { services: services.into(), store, ..RunReport::default() };
+        assert!(report.to_string().contains("haptic tick µs"));
+        serde_json::to_value(report).unwrap()
+    }
+
+    #[test]
+    fn the_report_has_the_keys_that_other_tools_read() {
+        let json = report(&control());
+        let durations = ["p50", "p99", "p999", "max"];
+        let mut paths: Vec<String> = Vec::new();
+        for service in ["haptic", "deformation", "rendering"] {
+            paths.extend(["pid", "restarts", "private_mib"].map(|key| format!("/services/{service}/{key}")));
+        }
+        paths.extend(["rate_hz", "overruns"].map(|key| format!("/services/haptic/{key}")));
+        paths.extend(["commits", "moved_elements"].map(|key| format!("/services/deformation/{key}")));
+        paths.push("/services/rendering/frames".into());
+        for histogram in ["haptic/tick_us", "haptic/lateness_us", "deformation/step_us", "rendering/frame_ms"] {
+            paths.extend(durations.map(|key| format!("/services/{histogram}/{key}")));
+        }
+        paths.extend(["voxels_mib", "segment_mib", "spare_slots_low"].map(|key| format!("/store/{key}")));
+        for path in paths {
+            assert!(json.pointer(&path).is_some(), "{path} is missing in {json:#}");
+        }
+        assert_eq!(json.pointer("/store/voxels_mib").unwrap(), 2.0);
+        assert_eq!(json.pointer("/store/segment_mib").unwrap(), 4.0);
+    }
+
+    #[test]
+    fn numbers_come_in_the_units_of_their_keys() {
+        let control = control();
+        let haptic = control.service(Role::Haptic);
+        haptic.count(Counter::Iterations, 9_000);
+        haptic.count(Counter::RecordedNs, 9_000_000_000);
+        haptic.duration.record(25_000);
+        control.service(Role::Rendering).duration.record(30_000_000);
+        let json = report(&control);
+        let number = |path: &str| json.pointer(path).unwrap().as_f64().unwrap();
+        assert_eq!(number("/services/haptic/rate_hz"), 1000.0);
+        assert_eq!(number("/services/haptic/tick_us/max"), 25.0);
+        assert_eq!(number("/services/rendering/frame_ms/max"), 30.0);
+    }
+}
