@@ -1,0 +1,271 @@
+//! The run as a feed: control block, messages and frames of a domain.
+//!
+//! The grid is read from the store's index once, at the start; no voxel stays mapped.
+
+use crate::{
+    ConsoleError,
+    feed::{Facts, Feed, ServiceStatus, default_view},
+    presets,
+};
+use maille_contract::{
+    Commit, FrameHeader, Role, ServiceCell, ServiceState, ToolCommand, ToolState, ViewState,
+    control::{Counter, HEARTBEAT_LATE_NS},
+};
+use maille_raycast::{Preset, Transfer};
+use maille_scene::{BoxMm, CameraKind, Mode, Scene};
+use maille_store::Reader;
+use maille_transport::{ControlMap, Domain, FrameSubscriber, Node, Publisher, Subscriber, monotonic_ns};
+use std::sync::atomic::Ordering::Relaxed;
+
+/// Messages taken in one round: more than come in it, and a bound.
+const MESSAGES_A_ROUND: usize = 256;
+
+/// The console's life: opens what it needs in a domain, serves the page, ends when the run does.
+///
+/// `parent_pid` is the supervisor that started it, if any; a supervisor that dies stops beating in the control block, and that
+/// ends the console whoever started it.
+///
+/// # Errors
+/// When the domain, its scene or the port cannot be had.
+pub fn run(domain: &str, parent_pid: Option<u32>) -> Result<(), ConsoleError> {
+    let _ = parent_pid;
+    let domain = Domain::named(domain)?;
+    let control = ControlMap::open(&domain)?;
+    let cell = control.service(Role::Console);
+    cell.set_state(ServiceState::Starting);
+    cell.heartbeat_ns.store(monotonic_ns(), Relaxed);
+    let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| ConsoleError::Scene(e.to_string()))?;
+    let (listener, port) = crate::listen(scene.console.port)?;
+    let quality = scene.console.jpeg_quality;
+    let feed = Live::open(&domain, control, &scene)?;
+    feed.control.console_port.store(u64::from(port), Relaxed);
+    feed.cell().ready_ns.store(monotonic_ns(), Relaxed);
+    feed.cell().set_state(ServiceState::Ready);
+    crate::serve(feed, listener, quality)
+}
+
+struct Live {
+    control: ControlMap,
+    facts: Facts,
+    first_view: ViewState,
+    frames: FrameSubscriber,
+    tool_states: Subscriber<ToolState>,
+    commits: Subscriber<Commit>,
+    views: Publisher<ViewState>,
+    commands: Publisher<ToolCommand>,
+    /// messages taken since the last beat
+    taken: usize,
+    frames_counted: u64,
+    refused_counted: u64,
+    // last: ports go before the node they hang on
+    _node: Node,
+}
+
+impl Live {
+    fn open(domain: &Domain, control: ControlMap, scene: &Scene) -> Result<Self, ConsoleError> {
+        let node = Node::open(domain, Role::Console.word())?;
+        let grid = Reader::open(domain, Role::Console).map_err(|e| ConsoleError::Store(e.to_string()))?.info().grid.clone();
+        let box_mm = BoxMm::of(&grid);
+        let facts = Facts {
+            scene: scene.name.clone(),
+            description: scene.description.clone(),
+            domain: domain.name().into(),
+            low_mm: box_mm.low,
+            high_mm: box_mm.high,
+            size: grid.size,
+            spacing_mm: grid.spacing,
+            max_force_n: scene.haptic.max_force_n,
+            endoscope_fov_deg: scene.rendering.endoscope_fov_deg,
+            transfer: scene.rendering.transfer.clone(),
+            transfer_points: transfer(&scene.rendering.transfer).map(|t| presets::points(&t)).unwrap_or_default(),
+            has_tool: scene.tool.is_some(),
+        };
+        // what the last console said, or the supervisor before the first
+        let told = control.view.load::<ViewState>().and_then(|(view, _)| view.checked());
+        Ok(Self {
+            first_view: told.unwrap_or_else(|| scene_view(scene, &box_mm)),
+            facts,
+            frames: node.frame_subscriber()?,
+            tool_states: node.subscriber()?,
+            commits: node.subscriber()?,
+            views: node.publisher()?,
+            commands: node.publisher()?,
+            control,
+            taken: 0,
+            frames_counted: 0,
+            refused_counted: 0,
+            _node: node,
+        })
+    }
+
+    fn cell(&self) -> &ServiceCell {
+        self.control.service(Role::Console)
+    }
+
+    /// Whether another message may be taken in this round.
+    fn may_take(&mut self) -> bool {
+        self.taken += 1;
+        self.taken <= MESSAGES_A_ROUND
+    }
+}
+
+/// The scene's transfer function: a preset, or a file; `None` where neither can be read here (rendering says why).
+fn transfer(name: &str) -> Option<Transfer> {
+    // `soft` and `soft-tissue` are the same
+    let word = |name: &str| name.split('-').next().map(str::to_owned);
+    let preset = Preset::ALL.into_iter().find(|p| word(p.name()) == word(name));
+    preset.map(Preset::transfer).or_else(|| Transfer::from_text(&std::fs::read_to_string(name).ok()?).ok())
+}
+
+/// What the scene asks to be shown first.
+fn scene_view(scene: &Scene, box_mm: &BoxMm) -> ViewState {
+    let rendering = &scene.rendering;
+    let seen = rendering.view(box_mm);
+    ViewState {
+        threshold_hu: scene.deformation.threshold_hu,
+        mode: u64::from(rendering.mode == Mode::Isosurface),
+        camera: u64::from(rendering.camera == CameraKind::Endoscope),
+        eye_mm: seen.eye,
+        target_mm: seen.target,
+        up: seen.up,
+        fov_deg: seen.fov_deg,
+        window_center_hu: rendering.section_window_hu[0],
+        window_width_hu: rendering.section_window_hu[1],
+        sections_follow_tool: u64::from(scene.tool.is_some()),
+        ..default_view(box_mm.low, box_mm.high)
+    }
+}
+
+impl Feed for Live {
+    fn facts(&self) -> &Facts {
+        &self.facts
+    }
+
+    fn first_view(&self) -> ViewState {
+        self.first_view
+    }
+
+    fn incarnation(&self) -> u64 {
+        self.cell().incarnation.load(Relaxed)
+    }
+
+    fn now_ns(&self) -> u64 {
+        monotonic_ns()
+    }
+
+    fn time_ns(&self) -> u64 {
+        self.control.time_ns(monotonic_ns())
+    }
+
+    fn frame(&mut self, show: &mut dyn FnMut(&FrameHeader, &[u8])) -> bool {
+        let Some(sample) = self.frames.latest() else { return false };
+        show(sample.header(), sample.bytes());
+        true
+    }
+
+    fn tool_state(&mut self) -> Option<ToolState> {
+        self.may_take().then(|| self.tool_states.next()).flatten()
+    }
+
+    fn commit(&mut self) -> Option<Commit> {
+        self.may_take().then(|| self.commits.next()).flatten()
+    }
+
+    fn services(&mut self) -> Vec<ServiceStatus> {
+        let now = monotonic_ns();
+        Role::ALL.into_iter().map(|role| status(role, self.control.service(role), now)).collect()
+    }
+
+    fn send_view(&mut self, view: &ViewState) {
+        self.control.view.store(view);
+        // a message that could not be sent is not lost: the cell has it, and every reader looks there when it starts
+        let _ = self.views.send(view);
+    }
+
+    fn send_command(&mut self, command: &ToolCommand) {
+        self.control.command.store(command);
+        let _ = self.commands.send(command);
+    }
+
+    fn beat(&mut self, frames: u64, refused: u64) {
+        self.taken = 0;
+        let cell = self.control.service(Role::Console);
+        cell.heartbeat_ns.store(monotonic_ns(), Relaxed);
+        cell.count(Counter::Sent, frames - self.frames_counted);
+        cell.count(Counter::Refused, refused - self.refused_counted);
+        (self.frames_counted, self.refused_counted) = (frames, refused);
+    }
+
+    fn should_end(&self) -> bool {
+        self.control.should_end(monotonic_ns())
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        // a page that is not there any more should not be announced
+        self.control.console_port.store(0, Relaxed);
+        self.cell().set_state(ServiceState::Ended);
+    }
+}
+
+fn status(role: Role, cell: &ServiceCell, now: u64) -> ServiceStatus {
+    let beat = cell.heartbeat_ns.load(Relaxed);
+    let age_ns = now.saturating_sub(beat);
+    let late = beat > 0 && age_ns > HEARTBEAT_LATE_NS;
+    let state = match cell.state() {
+        ServiceState::Absent => "absent",
+        ServiceState::Ended => "ended",
+        _ if late => "stopped",
+        ServiceState::Starting => "starting",
+        ServiceState::Ready => "ready",
+    };
+    let times = cell.duration.percentiles();
+    ServiceStatus {
+        role: role.word(),
+        pid: cell.pid.load(Relaxed),
+        restarts: cell.restarts.load(Relaxed),
+        state,
+        beat_age_ms: if beat > 0 { age_ns as f64 * 1e-6 } else { 0.0 },
+        iterations: cell.counter(Counter::Iterations),
+        overruns: cell.counter(Counter::Overruns),
+        commits: cell.counter(Counter::Commits),
+        p50_us: times.p50 * 1e-3,
+        p99_us: times.p99 * 1e-3,
+        max_us: times.max * 1e-3,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::Zeroable;
+
+    #[test]
+    fn a_service_whose_heart_is_late_is_shown_as_stopped() {
+        let cell = &ServiceCell::zeroed();
+        let seen = |now| status(Role::Rendering, cell, now).state;
+        assert_eq!(seen(1), "absent");
+        cell.set_state(ServiceState::Ready);
+        cell.heartbeat_ns.store(1_000, Relaxed);
+        assert_eq!(seen(1_000 + HEARTBEAT_LATE_NS), "ready");
+        assert_eq!(seen(1_001 + HEARTBEAT_LATE_NS), "stopped");
+        cell.set_state(ServiceState::Ended);
+        assert_eq!(seen(1_001 + HEARTBEAT_LATE_NS), "ended");
+    }
+
+    #[test]
+    fn the_scene_s_first_view_can_be_shown() {
+        let box_mm = BoxMm { low: [-100.0, -120.0, 0.0], high: [100.0, 120.0, 180.0] };
+        let view = scene_view(&Scene::default(), &box_mm);
+        assert!(view.checked().is_some(), "{view:?}");
+    }
+
+    #[test]
+    fn every_preset_of_a_scene_is_known() {
+        for name in maille_scene::TRANSFER_PRESETS {
+            assert!(transfer(name).is_some(), "{name}");
+        }
+        assert!(transfer("no such file").is_none());
+    }
+}

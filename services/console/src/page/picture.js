@@ -1,0 +1,38 @@
+// Panel "Picture": mode, camera, threshold, window, sections.
+
+const $ = (id) => document.getElementById(id);
+
+export class Picture {
+  constructor(model, mouse) {
+    this.mouse = mouse;
+    const on = (id, event, patch) => $(id).addEventListener(event, (e) => { const p = patch(e.target); if (Object.values(p).every((v) => v === v)) model.edit(p); });
+    on("mode-volume", "click", () => ({ mode: 0 }));
+    on("mode-surface", "click", () => ({ mode: 1 }));
+    on("camera-free", "click", () => ({ camera: 0 }));
+    on("camera-tip", "click", () => ({ camera: 1 }));
+    on("threshold", "input", (e) => ({ threshold_hu: e.valueAsNumber }));
+    on("threshold-number", "change", (e) => ({ threshold_hu: e.valueAsNumber }));
+    on("window-center", "input", (e) => ({ window_center_hu: e.valueAsNumber }));
+    on("window-width", "input", (e) => ({ window_width_hu: e.valueAsNumber }));
+    on("follow", "change", (e) => ({ sections_follow_tool: e.checked }));
+    $("reset-camera").onclick = () => mouse.resetCamera();
+  }
+
+  hello(model) {
+    this.mouse.hello(model);
+    $("camera-tip").disabled = $("follow").disabled = !model.facts.has_tool;
+  }
+
+  state({ view }) {
+    if (!view) return;
+    const press = (id, on) => $(id).setAttribute("aria-pressed", on);
+    press("mode-volume", view.mode === 0); press("mode-surface", view.mode === 1);
+    press("camera-free", view.camera === 0); press("camera-tip", view.camera === 1);
+    const put = (id, value) => { if (document.activeElement !== $(id) || $(id).type === "range") $(id).value = value; };
+    put("threshold", view.threshold_hu); put("threshold-number", Math.round(view.threshold_hu));
+    put("window-center", view.window_center_hu); put("window-width", view.window_width_hu);
+    $("window-center-now").textContent = `${view.window_center_hu.toFixed(0)} HU`;
+    $("window-width-now").textContent = `${view.window_width_hu.toFixed(0)} HU`;
+    $("follow").checked = view.sections_follow_tool;
+  }
+}
