@@ -361,6 +361,9 @@ impl HapticCore {
         if self.last_point.is_some() {
             let change = before.filter(|_| blend.is_some()).map(|before| before - d);
             self.carry(change, committed && !other_surface, d, point, dt);
+        } else if moved {
+            // already pressed where it is found first: felt gradually
+            self.bias = -d.max(0.0);
         }
         let delta = (d + self.give_way + self.bias).max(0.0);
         if delta <= 0.0 && d <= 0.0 {

@@ -177,6 +177,26 @@ fn tool_moves_lead_from_outside_into_the_tissue() {
     assert!(moves > 5, "{moves}");
 }
 
+/// A tip of 2 mm in a slit of 2 mm, from the start and after a jump: the walls come to be felt, without a step.
+#[test]
+fn a_cavity_narrower_than_the_tip_is_felt_gradually() {
+    let volume = sampled(48, |x| edge(x.x.abs() - 1.0));
+    let tissue = Isosurface::new(&volume, 0.0);
+    let mut d = Driver::new(HapticConfig { friction: false, ..config() });
+    for start in [0.0, 15.0] {
+        let mut last: Option<V3> = None;
+        for n in 0..1500 {
+            let out = d.tick(&tissue, 1, V3::new(0.2, 0.0, start));
+            let f = V3::from(out.force_n);
+            assert!(last.replace(f).is_none_or(|last| (f - last).norm() <= MAX_STEP_N), "{n}");
+            assert!(!out.buried);
+        }
+        // the nearer wall is at x = 1: depth 2 − 0.8, in bone at 2 N/mm
+        let f = last.unwrap();
+        assert!((f.x + 2.4).abs() < 0.1 && f.yz().norm() < 0.01, "{f:?}");
+    }
+}
+
 /// A hand that presses on a stiff wall stays quiet: gains within the passive bound.
 #[test]
 fn a_simulated_hand_rests_on_a_stiff_wall() {

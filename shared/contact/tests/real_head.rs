@@ -89,3 +89,56 @@ fn sliding_over_skin_and_skull_keeps_contact_and_gives_no_step() {
         assert!(worst <= 0.05, "threshold {threshold}: worst step {:.1} %", worst * 100.0);
     }
 }
+
+/// In air pockets of the head (nose, sinuses), narrower and wider than the tip, a loosely held tool is pushed about at random: force and
+/// slew stay within the limits, and no tip that starts in air is ever treated as buried.
+#[test]
+fn in_narrow_cavities_the_force_is_bounded_and_no_tip_is_buried() {
+    let Some(volume) = head() else { return };
+    let tissue = Isosurface::new(&volume, -300.0);
+    let center = V3::from(volume.info().grid.center());
+    let mut seed = 12_345u64;
+    let mut random = move || {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (seed >> 33) as f64 / (1u64 << 31) as f64 - 0.5
+    };
+    let (mut pockets, mut felt) = (0, 0);
+    while pockets < 8 {
+        let start = center + V3::new(random() * 50.0, random() * 50.0 - 40.0, random() * 70.0 - 20.0);
+        let air = |x: f64| tissue.value((start + V3::x() * x).into()).is_some_and(|v| v < -300.0);
+        if !(air(0.0) && air(1.0) && air(-1.0)) || air(8.0) && air(-8.0) {
+            continue;
+        }
+        pockets += 1;
+        for radius_mm in [0.8, 3.0] {
+            let mut core = HapticCore::new(HapticConfig::new(radius_mm, Coupling::new(2.0, 5e-4, 0.003, 1e-3).unwrap()));
+            let mut hand = SimulatedHand::new(Grip::LIGHT, start.into(), [0.0, 0.0, -1.0]);
+            let (mut last, mut target) = (V3::zeros(), start);
+            for n in 0..1000u64 {
+                if n % 200 == 0 {
+                    target = start + V3::new(random(), random(), random()) * 20.0;
+                }
+                let now = V3::from(hand.target_mm());
+                hand.set_target((now + (target - now) * 0.01).into());
+                let now_ns = n * 1_000_000;
+                let pose = hand.read(now_ns);
+                let out = core.tick(&TickInputs {
+                    now_ns,
+                    pose,
+                    pose_age_s: 0.0,
+                    tissue: Some(&tissue),
+                    epoch: 0,
+                    tissue_age_s: 0.0,
+                    release: false,
+                });
+                hand.write(out.force_n);
+                let f = V3::from(out.force_n);
+                assert!(f.norm() <= 3.3 + 1e-9 && (f - last).norm() <= 0.1 + 1e-9, "{n}: {last:?} {f:?}");
+                assert!(!out.buried);
+                felt += u32::from(out.in_contact);
+                last = f;
+            }
+        }
+    }
+    assert!(felt > 4000, "the walls are felt: {felt} of 16000 ticks");
+}
