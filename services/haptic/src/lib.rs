@@ -1,1 +1,88 @@
-//! Placeholder: replaced by the part's first commit.
+//! The haptic process: device, contact, force, a thousand times a second.
+//!
+//! The loop samples: the device, the newest commit (a pinned snapshot read in place), the page's commands and the threshold
+//! (latest-value cells), and never waits for any of them. It allocates nothing, takes no lock and makes no blocking
+//! call; what it has to say to others goes through cells to a [`publisher`] thread. When deformation is silent it goes on
+//! with the last committed tissue; when the run ends or the supervisor dies, the force fades to zero first.
+//!
+//! Numerics are `maille-contact`'s; time is simulation time (DESIGN D10).
+
+#![forbid(unsafe_code)]
+
+mod operator;
+mod outbox;
+mod publisher;
+mod setup;
+mod tick;
+
+use maille_contract::{Role, control::Counter};
+use maille_realtime::{Period, enter_realtime, lock_memory, monotonic_ns, prefault_stack, steady};
+use maille_scene::Scene;
+use maille_store::Reader;
+use maille_transport::{Domain, Life};
+use std::sync::Arc;
+use thiserror::Error;
+
+/// Why the haptic process could not start.
+#[derive(Debug, Error)]
+#[allow(missing_docs)] // the sentences say it
+pub enum HapticError {
+    #[error(transparent)]
+    Transport(#[from] maille_transport::TransportError),
+    #[error(transparent)]
+    Store(#[from] maille_store::StoreError),
+    #[error("the scene of this run cannot be read: {0}")]
+    Scene(String),
+    #[error("this scene has no [tool]: there is nothing for the haptic process to do")]
+    NoTool,
+    #[error("the thread that publishes poses could not start: {0}")]
+    Thread(std::io::Error),
+}
+
+/// Longest time given to the force to fade when the run ends [ns].
+const LEAVE_NS: u64 = 400_000_000;
+
+/// Runs the loop until the run ends.
+///
+/// # Errors
+/// When something it needs is missing at the start.
+pub fn run(domain: &str) -> Result<(), HapticError> {
+    let domain = Domain::named(domain)?;
+    let mut life = Life::begin(&domain, Role::Haptic)?;
+    let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| HapticError::Scene(e.to_string()))?;
+    let reader = Reader::open(&domain, Role::Haptic)?;
+    let outbox = Arc::new(outbox::Outbox::new());
+    let publisher = publisher::start(&domain, &scene, Arc::clone(&outbox), life.incarnation())?;
+    let mut tick = tick::Loop::new(&scene, &reader, outbox, publisher.thread().clone())?;
+
+    let notices = enter_realtime(scene.haptic.priority.clamp(1, 99) as i32, scene.haptic.cpu);
+    for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {
+        eprintln!("maille-haptic: {notice}");
+        life.cell().count(Counter::NotRealtime, 1);
+    }
+    prefault_stack();
+    life.ready();
+    let mut period = Period::new(scene.haptic.rate_hz);
+    let mut leaving_since = None;
+    loop {
+        let released = period.wait();
+        let began = monotonic_ns();
+        if !life.beat(began) && leaving_since.is_none() {
+            leaving_since = Some(began);
+        }
+        let (force_n, allocations) = steady(|| tick.run(&life, began, leaving_since.is_some()));
+        if life.record(began, monotonic_ns().saturating_sub(began), Some(released.lateness_ns)) {
+            let cell = life.cell();
+            cell.count(Counter::Allocations, allocations);
+            cell.count(Counter::Overruns, released.missed);
+            tick.count(cell);
+        }
+        if let Some(since) = leaving_since
+            && (force_n == [0.0; 3] || began - since > LEAVE_NS)
+        {
+            break;
+        }
+    }
+    publisher.stop();
+    Ok(())
+}

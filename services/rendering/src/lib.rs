@@ -1,1 +1,107 @@
-//! Placeholder: replaced by the part's first commit.
+//! The rendering process: the newest commit, ray-cast where it lies, out as frames.
+//!
+//! At the scene's rate it looks whether anything that is seen has changed (epoch, view, tool); if so it pins a snapshot, brings
+//! the map of empty space up to date for the bricks whose versions changed, draws the views and publishes them as one
+//! loaned sample. The pin is held for one frame. When nothing changes a frame goes out twice a second, so that a page
+//! that joins sees something.
+
+#![forbid(unsafe_code)]
+
+mod compose;
+mod overlay;
+mod view;
+
+use maille_contract::{Role, ToolState, control::Counter};
+use maille_scene::{BoxMm, Machine, Scene};
+use maille_store::Reader;
+use maille_transport::{Domain, Life, Node, monotonic_ns};
+use std::time::Duration;
+use thiserror::Error;
+
+/// Why the rendering process could not start.
+#[derive(Debug, Error)]
+#[allow(missing_docs)] // the sentences say it
+pub enum RenderingError {
+    #[error(transparent)]
+    Transport(#[from] maille_transport::TransportError),
+    #[error(transparent)]
+    Store(#[from] maille_store::StoreError),
+    #[error("the scene of this run cannot be read: {0}")]
+    Scene(String),
+    #[error("the transfer function `{name}` cannot be used: {reason}")]
+    Transfer { name: String, reason: String },
+    #[error("the thread pool could not be made: {0}")]
+    Threads(#[from] rayon::ThreadPoolBuildError),
+}
+
+/// A still picture is sent again after this time [ns].
+const STILL_NS: u64 = 500_000_000;
+/// Longest sleep between beats.
+const NAP: Duration = Duration::from_millis(10);
+
+/// Runs until the run ends.
+///
+/// # Errors
+/// When something it needs is missing at the start.
+pub fn run(domain: &str) -> Result<(), RenderingError> {
+    let domain = Domain::named(domain)?;
+    let mut life = Life::begin(&domain, Role::Rendering)?;
+    let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| RenderingError::Scene(e.to_string()))?;
+    let reader = Reader::open(&domain, Role::Rendering)?;
+    let node = Node::open(&domain, "rendering")?;
+    let mut composer = compose::Composer::new(&scene);
+    let frames = node.frame_publisher(composer.bytes())?;
+    let machine = Machine { cores: std::thread::available_parallelism().map_or(1, usize::from) };
+    let plan = maille_scene::plan(&scene, &reader.info().grid, machine);
+    let threads = plan.process(maille_scene::Process::Rendering).map_or(1, |p| p.threads);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|n| format!("rays-{n}")).build()?;
+    let mut view = view::View::new(&scene, &BoxMm::of(&reader.info().grid))?;
+    life.ready();
+    let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
+    let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
+    let mut shown: Option<(u64, u64, Option<[f64; 3]>)> = None;
+    loop {
+        let now = monotonic_ns();
+        if !life.beat(now) {
+            return Ok(());
+        }
+        if now < next {
+            std::thread::sleep(NAP.min(Duration::from_nanos(next - now)));
+            continue;
+        }
+        next = if now - next > period_ns { now + period_ns } else { next + period_ns };
+        if !view.listen(life.control()) {
+            life.cell().count(Counter::Refused, 1);
+        }
+        let tool = life.control().tool.load::<ToolState>().map(|(tool, _)| tool);
+        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())));
+        if shown == Some(seen) && now - last_sent_ns < STILL_NS {
+            continue;
+        }
+        shown = Some(seen);
+        let snapshot = reader.snapshot();
+        let drawn = pool.install(|| composer.draw(&snapshot, &view, tool.as_ref()));
+        let render_ns = monotonic_ns() - now;
+        let epoch = snapshot.epoch();
+        drop(snapshot);
+        if let Err(reason) = drawn {
+            // a view that cannot be drawn (a camera that looks nowhere) leaves the last picture standing
+            view.fall_back(&reason.to_string());
+            life.cell().count(Counter::Refused, 1);
+            continue;
+        }
+        sent += 1;
+        let stamp = life.stamp(sent);
+        let bytes = composer.bytes();
+        match frames.send(bytes, |pixels| composer.write(pixels, stamp, epoch, view.sequence(), render_ns)) {
+            Ok(()) => {
+                life.cell().count(Counter::Sent, 1);
+                life.cell().count(Counter::BytesSent, bytes as u64);
+            }
+            // every sample is held by readers: this frame is dropped, the next will do
+            Err(_) => life.cell().count(Counter::Deferred, 1),
+        }
+        last_sent_ns = now;
+        life.record(now, monotonic_ns() - now, None);
+    }
+}

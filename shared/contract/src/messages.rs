@@ -63,8 +63,12 @@ pub struct ToolMove {
     pub tip_mm: [f64; 3],
     /// last position of the tip that was outside the tissue [mm]: where the search for the intersection ends
     pub outside_mm: [f64; 3],
-    /// surface normal at the contact, unit, out of the tissue; zero when unknown
+    /// foot of the tip on the surface [mm]
+    pub contact_mm: [f64; 3],
+    /// surface normal there, unit, out of the tissue
     pub normal: [f64; 3],
+    /// how far the deepest point of the tip lies below the surface [mm]
+    pub depth_mm: f64,
     /// radius of the tip [mm]
     pub radius_mm: f64,
 }
@@ -186,7 +190,9 @@ impl ToolMove {
     /// The message, if its numbers can be used.
     pub fn checked(self) -> Option<Self> {
         let ok =
-            finite(&self.tip_mm) && finite(&self.outside_mm) && finite(&self.normal) && self.radius_mm.is_finite() && self.radius_mm > 0.0;
+            [self.tip_mm, self.outside_mm, self.contact_mm, self.normal].iter().all(|v| finite(v))
+            && finite(&[self.depth_mm, self.radius_mm])
+            && self.radius_mm > 0.0;
         ok.then_some(self)
     }
 }

@@ -14,10 +14,12 @@
 #![deny(unsafe_code)]
 
 pub mod domain;
+pub mod life;
 pub mod messages;
 pub mod segment;
 
 pub use domain::Domain;
+pub use life::Life;
 pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber};
 pub use segment::{Access, ControlMap, Segment};
 

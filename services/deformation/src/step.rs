@@ -1,0 +1,129 @@
+//! One step: from a tool move to a committed transaction.
+//!
+//! Where the tool met the surface: the tip's deepest point is the thesis's eye point; from there the search goes back
+//! towards where that point was while the tip was outside, until it leaves the tissue (Dräger 2005, fig. 3.17). The push is the
+//! vector from that intersection to the deepest point, so that after it the tip is outside. Where the search finds nothing
+//! (the tip slid along a wall), the contact's own foot point, normal and depth say the same. The elements that are moved
+//! are those whose tissue now lies at the intersection: its rest position is found by the mapper's inversion.
+
+use crate::state::{State, VERSION};
+use maille_chainmail::{Admission, ChainMail, ChangedRegion, Motion, Pin, Tissue, elements_in_sphere, enclosing_elements, intersection_search};
+use maille_contract::ToolMove;
+use maille_displacement::along_axes;
+use maille_mapper::{BrickSink, MapOptions, remap, rest_position};
+use maille_scene::{Pins, Push, Scene};
+use maille_store::{CommitOutcome, Reader, Transaction, Writer};
+use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
+
+/// Pushes shorter than this are not worth a transaction [mm].
+const SHORTEST_PUSH_MM: f64 = 0.01;
+
+/// ChainMail with what a scene says of it.
+pub(crate) struct Engine {
+    pub mail: ChainMail,
+    pub state: State,
+    pins: Pins,
+    push_scale: f64,
+    map: MapOptions,
+}
+
+/// What a step did.
+pub(crate) struct Done {
+    pub outcome: CommitOutcome,
+    pub moved_elements: u64,
+    pub bricks: u64,
+    pub failures: u64,
+    pub refused_mm: [f64; 3],
+}
+
+/// The mapper writes into a transaction.
+struct Sink<'t, 'w>(&'t mut Transaction<'w>);
+
+impl BrickSink for Sink<'_, '_> {
+    fn edit(&mut self, id: BrickId) -> &mut Brick {
+        self.0.brick_mut(id)
+    }
+}
+
+impl Engine {
+    pub fn new(scene: &Scene, info: &VolumeInfo) -> Self {
+        let d = &scene.deformation;
+        let tissue = Tissue {
+            offset: d.offset as f32,
+            density_scaling: d.density_scaling,
+            // all links exist: links through tissue only, as the live threshold has it, come with object shape
+            threshold_hu: None,
+            bone_hu: Some(d.bone_hu),
+            movement_limit_mm: Some(d.movement_limit_mm as f32),
+            admission: match d.push {
+                Push::Scale => Admission::Scaled,
+                Push::Clamp => Admission::ByComponent,
+            },
+        };
+        let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: None };
+        let state = State { version: VERSION, threshold_hu: d.threshold_hu, last_move: 0, pushes: 0 };
+        Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map }
+    }
+
+    /// Tissue begins at another value from now on.
+    pub fn set_threshold(&mut self, threshold_hu: f64) {
+        self.state.threshold_hu = threshold_hu;
+    }
+
+    /// Answers a tool move; `None` when there is nothing to push.
+    pub fn step(&mut self, message: &ToolMove, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let (from, push) = self.surface_push(message, reader)?;
+        let grid = &reader.info().grid;
+        let rest_mm = rest_position(&self.mail, grid, from)?;
+        let elements = match self.pins {
+            Pins::Enclosing => enclosing_elements(grid, rest_mm),
+            Pins::Sphere => elements_in_sphere(grid, rest_mm, message.radius_mm),
+        };
+        let motion = Motion::By(along_axes(grid, push).map(|v| v as f32));
+        let pins: Vec<Pin> = elements.into_iter().map(|voxel| Pin { voxel, motion }).collect();
+        let rest = reader.rest();
+        let pushed = self.mail.push(&rest, &pins);
+        if pushed.moved == 0 {
+            return None;
+        }
+        self.state.last_move = message.stamp.sequence;
+        self.state.pushes += 1;
+        let mut transaction = writer.begin();
+        let mapped = remap(&rest, &self.mail, &pushed.region, &mut Sink(&mut transaction), &self.map);
+        self.commit_displacement(&pushed.region, &mut transaction);
+        self.state.write(transaction.state_mut());
+        let refused = maille_displacement::in_patient(grid, pushed.refused_mm.map(f64::from));
+        Some(Done {
+            outcome: transaction.commit(),
+            moved_elements: pushed.moved,
+            bricks: mapped.bricks.len() as u64,
+            failures: mapped.failures,
+            refused_mm: refused,
+        })
+    }
+
+    /// Where the surface was met and how far it must go [mm, patient], if it must.
+    fn surface_push(&self, m: &ToolMove, reader: &Reader) -> Option<([f64; 3], [f64; 3])> {
+        let snapshot = reader.snapshot();
+        let sampler = Sampler::new(&snapshot);
+        let is_tissue = |at: [f64; 3]| sampler.value(at).is_some_and(|v| v >= self.state.threshold_hu);
+        let below = |at: [f64; 3]| -> [f64; 3] { std::array::from_fn(|c| at[c] - m.radius_mm * m.normal[c]) };
+        let eye = below(m.tip_mm);
+        let step = 0.25 * reader.info().grid.min_spacing();
+        let (from, full): ([f64; 3], [f64; 3]) = match intersection_search(is_tissue, eye, below(m.outside_mm), step) {
+            Some(met) => (met, std::array::from_fn(|c| eye[c] - met[c])),
+            None => (m.contact_mm, std::array::from_fn(|c| -m.depth_mm * m.normal[c])),
+        };
+        let push = full.map(|v| v * self.push_scale);
+        let length = push.iter().map(|v| v * v).sum::<f64>().sqrt();
+        (length >= SHORTEST_PUSH_MM).then_some((from, push))
+    }
+
+    fn commit_displacement(&self, region: &ChangedRegion, transaction: &mut Transaction<'_>) {
+        for id in region.ids() {
+            if let Some(brick) = self.mail.displacement_brick(id) {
+                transaction.displacement_mut(id).copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(brick)));
+            }
+        }
+    }
+}

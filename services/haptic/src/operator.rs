@@ -1,0 +1,163 @@
+//! Who holds the tool: the scene's script, a simulated hand, or the page; and how it passes from one to the other.
+//!
+//! The page takes the tool where it is and drags it through a critically damped follower; when it lets go (or falls silent
+//! for [`SILENT_NS`]), the script takes over from where the tool was left: the offset to the script's way is taken away
+//! smoothly, no faster than [`RETURN_MM_S`], so that nothing jumps.
+
+use maille_contact::{ConsoleDevice, Device as _, DevicePose, Grip, SimulatedHand};
+use maille_contract::ToolCommand;
+use maille_scene::{Device, Hand, Tool, Waypoints};
+
+/// A page that holds the tool and has not been heard of for this long has let go [ns].
+pub(crate) const SILENT_NS: u64 = 1_000_000_000;
+/// Mean speed of the way back to the script [mm/s].
+const RETURN_MM_S: f64 = 40.0;
+
+enum Holder {
+    /// the script itself, exactly followed
+    Script,
+    /// a hand that follows the script and yields to the force
+    Hand(Box<SimulatedHand>),
+}
+
+/// Moves the tool.
+pub(crate) struct Operator {
+    way: Waypoints,
+    holder: Holder,
+    page: Option<ConsoleDevice>,
+    /// offset from the script's way when the page let go [mm], when that was [ns], and how long it takes [ns]
+    back: Option<([f64; 3], u64, u64)>,
+    /// what is offset from the script while the page never held the tool
+    pose: DevicePose,
+    follow_script: bool,
+}
+
+impl Operator {
+    pub fn new(tool: &Tool, way: Waypoints) -> Self {
+        let start = way.at(0.0);
+        let pose = DevicePose { position_mm: start.position_mm, direction: start.direction, velocity_mm_s: None, valid: true };
+        let hand = || Box::new(SimulatedHand::new(grip(&tool.hand), start.position_mm, start.direction));
+        let holder = if tool.device == Device::Sim { Holder::Hand(hand()) } else { Holder::Script };
+        Self { way, holder, page: None, back: None, pose, follow_script: tool.device != Device::Console }
+    }
+
+    /// Pose at a simulation time; `command` is the page's last word and `monotonic_ns` the clock that it was sent by.
+    pub fn read(&mut self, now_ns: u64, monotonic_ns: u64, command: Option<&ToolCommand>) -> DevicePose {
+        let taken = command.filter(|c| c.taken == 1 && monotonic_ns.saturating_sub(c.sent_ns) < SILENT_NS);
+        self.pose = match taken {
+            Some(command) => {
+                let page = self.page.get_or_insert_with(|| ConsoleDevice::new(self.pose.position_mm, self.pose.direction));
+                page.set_target(command.target_mm);
+                page.read(now_ns)
+            }
+            None => self.scripted(now_ns),
+        };
+        self.pose
+    }
+
+    /// Whether the page holds the tool.
+    pub fn is_taken(&self) -> bool {
+        self.page.is_some()
+    }
+
+    fn scripted(&mut self, now_ns: u64) -> DevicePose {
+        if !self.follow_script {
+            // without a script the tool rests where it was left
+            self.page = None;
+            return DevicePose { velocity_mm_s: Some([0.0; 3]), ..self.pose };
+        }
+        let way = self.way.at(now_ns as f64 * 1e-9);
+        if self.page.take().is_some() {
+            let offset: [f64; 3] = std::array::from_fn(|c| self.pose.position_mm[c] - way.position_mm[c]);
+            let length = offset.iter().map(|v| v * v).sum::<f64>().sqrt();
+            self.back = Some((offset, now_ns, ((length / RETURN_MM_S).max(0.5) * 1e9) as u64));
+        }
+        let mut target = way.position_mm;
+        let mut velocity = way.velocity_mm_s;
+        if let Some((offset, since, duration)) = self.back {
+            let s = (now_ns.saturating_sub(since) as f64 / duration as f64).min(1.0);
+            let left = 1.0 - s * s * (3.0 - 2.0 * s);
+            let rate = -6.0 * s * (1.0 - s) / (duration as f64 * 1e-9);
+            for c in 0..3 {
+                target[c] += offset[c] * left;
+                velocity[c] += offset[c] * rate;
+            }
+            if s >= 1.0 {
+                self.back = None;
+            }
+        }
+        match &mut self.holder {
+            Holder::Script => DevicePose { position_mm: target, direction: way.direction, velocity_mm_s: Some(velocity), valid: true },
+            Holder::Hand(hand) => {
+                hand.set_target(target);
+                hand.read(now_ns)
+            }
+        }
+    }
+
+    /// The force on the hand.
+    pub fn write(&mut self, force_n: [f64; 3]) {
+        if let Holder::Hand(hand) = &mut self.holder {
+            hand.write(force_n);
+        }
+        if let Some(page) = &mut self.page {
+            page.write(force_n);
+        }
+    }
+}
+
+fn grip(hand: &Hand) -> Grip {
+    Grip { mass_kg: hand.mass_kg, stiffness_n_per_mm: hand.stiffness_n_per_mm, damping_n_s_per_mm: hand.damping_n_s_per_mm, ..Grip::FULL }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::Zeroable;
+    use maille_scene::Waypoint;
+
+    fn operator(device: Device) -> Operator {
+        let point = |time_s, x| Waypoint { time_s, position_mm: [x, 0.0, 0.0], direction: [1.0, 0.0, 0.0] };
+        let way = Waypoints::new(vec![point(0.0, 0.0), point(1.0, 10.0), point(2.0, 0.0)], true, None).unwrap();
+        Operator::new(&Tool { device, ..Tool::default() }, way)
+    }
+
+    #[test]
+    fn passing_the_tool_to_the_page_and_back_never_jumps() {
+        for device in [Device::Path, Device::Sim] {
+            let mut operator = operator(device);
+            let mut command = ToolCommand::zeroed();
+            command.target_mm = [30.0, 25.0, -10.0];
+            let mut last: Option<[f64; 3]> = None;
+            for tick in 0..8000u64 {
+                let now = tick * 1_000_000;
+                command.taken = u64::from((2000..5000).contains(&tick));
+                command.sent_ns = now;
+                let pose = operator.read(now, now, Some(&command));
+                assert_eq!(operator.is_taken(), command.taken == 1);
+                if let Some(last) = last {
+                    let step = (0..3).map(|c| (pose.position_mm[c] - last[c]).powi(2)).sum::<f64>().sqrt();
+                    // the follower is held to 150 mm/s, the script to 15, the way back to 60
+                    assert!(step < 0.16, "tick {tick}: {step} mm");
+                }
+                last = Some(pose.position_mm);
+                if tick == 4999 {
+                    assert!((pose.position_mm[1] - 25.0).abs() < 0.1, "the page's target is reached");
+                }
+            }
+            let script = operator.way.at(7.999).position_mm;
+            assert!((last.unwrap()[0] - script[0]).abs() < 1.0 && last.unwrap()[1].abs() < 0.5, "the script is followed again");
+        }
+    }
+
+    #[test]
+    fn a_page_that_falls_silent_has_let_go() {
+        let mut operator = operator(Device::Path);
+        let mut command = ToolCommand::zeroed();
+        (command.taken, command.target_mm) = (1, [5.0, 5.0, 5.0]);
+        operator.read(0, 100, Some(&command));
+        assert!(operator.is_taken());
+        operator.read(2_000_000_000, 100 + SILENT_NS, Some(&command));
+        assert!(!operator.is_taken());
+    }
+}

@@ -1,0 +1,35 @@
+//! From the scene's tables to the contact engine's configuration.
+
+use maille_contact::{Coupling, CouplingError, HapticConfig, Limits, Material, TissueTable};
+use maille_scene::{Scene, Tissue, Tool};
+
+/// Damping of a device of the Touch class [N·s/mm] (5 N·s/m, CHAI3D's table of devices): what the coupling may count on
+/// while no real device says otherwise.
+const DEVICE_DAMPING_N_S_PER_MM: f64 = 0.005;
+
+/// Configuration of the tick, and whether the coupling's gains had to be lowered to stay passive.
+pub(crate) fn config(scene: &Scene, tool: &Tool) -> Result<(HapticConfig, bool), CouplingError> {
+    let h = &scene.haptic;
+    let period_s = 1.0 / h.rate_hz;
+    let (coupling, lowered) =
+        Coupling::lowered(h.contact_stiffness_n_per_mm, h.contact_damping_n_s_per_mm, DEVICE_DAMPING_N_S_PER_MM, period_s)?;
+    let mut config = HapticConfig::new(tool.radius_mm, coupling);
+    config.period_s = period_s;
+    config.tissue = table(&scene.tissues);
+    config.limits = Limits { max_force_n: h.max_force_n, max_slew_n_per_s: h.max_slew_n_per_s, ramp_s: h.ramp_s, fade_s: h.fade_s };
+    Ok((config, lowered))
+}
+
+/// The table's rows as plateaus: a row's law holds over its whole range, and changes to the next over the last tenth of it.
+fn table(rows: &[Tissue]) -> TissueTable {
+    let material = |t: &Tissue| Material {
+        stiffness_n_per_mm: t.stiffness_n_per_mm,
+        stiffening_n_per_mm2: t.stiffening_n_per_mm2,
+        damping_n_s_per_mm: t.damping_n_s_per_mm,
+        friction_static: t.friction_static,
+        friction_kinetic: t.friction_kinetic,
+    };
+    let solid = rows.iter().filter(|t| t.stiffness_n_per_mm > 0.0 || t.stiffening_n_per_mm2 > 0.0);
+    let ends = |t: &Tissue| [(t.hu[0], material(t)), (t.hu[1] - 0.1 * (t.hu[1] - t.hu[0]), material(t))];
+    TissueTable::new(&solid.flat_map(ends).collect::<Vec<_>>())
+}

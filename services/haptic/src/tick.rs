@@ -1,0 +1,142 @@
+//! One tick of the loop: sample, compute, hand over. Bounded work, no allocation, nothing that waits.
+
+use crate::{HapticError, operator::Operator, outbox::Outbox, setup};
+use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs};
+use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
+use maille_contract::messages::{TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER};
+use maille_contract::{ControlBlock, Role, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
+use maille_scene::{BoxMm, Scene};
+use maille_store::Reader;
+use maille_transport::Life;
+use maille_volume::Sampler;
+use std::{sync::Arc, sync::atomic::Ordering::Relaxed, thread::Thread};
+
+/// State of the loop.
+pub(crate) struct Loop<'a> {
+    reader: &'a Reader,
+    core: HapticCore,
+    operator: Operator,
+    threshold_hu: f64,
+    view_seen: u64,
+    command: Option<ToolCommand>,
+    command_seen: u64,
+    ticks: u64,
+    outbox: Arc<Outbox>,
+    publisher: Thread,
+    last: Option<TickOutputs>,
+    degraded: bool,
+    refused: u64,
+}
+
+impl<'a> Loop<'a> {
+    /// Sets the loop up; everything that allocates happens here.
+    pub fn new(scene: &Scene, reader: &'a Reader, outbox: Arc<Outbox>, publisher: Thread) -> Result<Self, HapticError> {
+        let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
+        let (config, lowered) = setup::config(scene, tool).map_err(|e| HapticError::Scene(e.to_string()))?;
+        if lowered {
+            eprintln!(
+                "maille-haptic: the coupling's gains were lowered to {:.3} N/mm and {:.4} N·s/mm, the most that is passive at this rate",
+                config.coupling.stiffness_n_per_mm(),
+                config.coupling.damping_n_s_per_mm()
+            );
+        }
+        let rest = reader.rest();
+        let sampler = Sampler::new(&rest);
+        let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
+        Ok(Self {
+            reader,
+            core: HapticCore::new(config),
+            operator: Operator::new(tool, way.ok_or(HapticError::NoTool)?),
+            threshold_hu: scene.deformation.threshold_hu,
+            view_seen: 0,
+            command: None,
+            command_seen: 0,
+            ticks: 0,
+            outbox,
+            publisher,
+            last: None,
+            degraded: false,
+            refused: 0,
+        })
+    }
+
+    /// One tick at `monotonic_ns`; `release` fades the force. Returns the force [N].
+    pub fn run(&mut self, life: &Life, monotonic_ns: u64, release: bool) -> [f64; 3] {
+        let control = life.control();
+        let now_ns = control.time_ns(monotonic_ns);
+        self.listen(control);
+        let pose = self.operator.read(now_ns, monotonic_ns, self.command.as_ref());
+        let snapshot = self.reader.snapshot();
+        let surface = Isosurface::new(&snapshot, self.threshold_hu);
+        let epoch = snapshot.epoch();
+        // tissue stands as it was committed while its owner is silent: it is felt, and said
+        self.degraded = monotonic_ns.saturating_sub(control.service(Role::Deformation).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
+        let inputs = TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
+        let out = self.core.tick(&inputs);
+        self.operator.write(out.force_n);
+        self.ticks += 1;
+        self.hand_over(control, now_ns, epoch, pose.direction, &out);
+        self.last = Some(out);
+        out.force_n
+    }
+
+    /// Takes the latest threshold and the latest command, where there are new ones.
+    fn listen(&mut self, control: &ControlBlock) {
+        if control.view.generation() != self.view_seen
+            && let Some((view, generation)) = control.view.load::<ViewState>()
+        {
+            self.view_seen = generation;
+            match view.checked() {
+                Some(view) => self.threshold_hu = view.threshold_hu,
+                None => self.refused += 1,
+            }
+        }
+        if control.command.generation() != self.command_seen
+            && let Some((command, generation)) = control.command.load::<ToolCommand>()
+        {
+            self.command_seen = generation;
+            self.command = command.checked();
+            self.refused += u64::from(self.command.is_none());
+        }
+    }
+
+    fn hand_over(&self, control: &ControlBlock, time_ns: u64, epoch: u64, direction: [f64; 3], out: &TickOutputs) {
+        let flag = |on: bool, bit: u64| if on { bit } else { 0 };
+        let stamp = Stamp { time_ns, sequence: self.ticks, incarnation: 0 };
+        let state = ToolState {
+            stamp,
+            tip_mm: out.tip_mm,
+            proxy_mm: out.proxy_mm,
+            direction,
+            force_n: out.force_n,
+            penetration_mm: out.penetration_mm,
+            radius_mm: self.core.config().radius_mm,
+            flags: flag(out.in_contact, TOOL_IN_CONTACT) | flag(self.operator.is_taken(), TOOL_TAKEN_OVER) | flag(out.fading, TOOL_FADING),
+            epoch,
+        };
+        control.tool.store(&state);
+        self.outbox.state.store(&state);
+        if let Some(m) = out.tool_move {
+            let message = ToolMove {
+                stamp: Stamp { sequence: m.sequence, ..stamp },
+                tip_mm: m.tip_mm,
+                outside_mm: m.outside_mm,
+                contact_mm: m.contact_mm,
+                normal: m.normal,
+                depth_mm: m.depth_mm,
+                radius_mm: m.radius_mm,
+            };
+            self.outbox.moves.store(&message);
+            self.publisher.unpark();
+        }
+    }
+
+    /// Counts what the last tick was like.
+    pub fn count(&mut self, cell: &ServiceCell) {
+        if let Some(out) = &self.last {
+            cell.count(Counter::InContact, u64::from(out.in_contact));
+            cell.count(Counter::Degraded, u64::from(out.fading || self.degraded));
+        }
+        cell.count(Counter::Refused, std::mem::take(&mut self.refused));
+    }
+}

@@ -1,0 +1,68 @@
+//! A frame: four views drawn, then laid side by side in one sample.
+
+use crate::{overlay, view::View};
+use maille_contract::{FrameHeader, Stamp, ToolState, messages::ViewRect};
+use maille_raycast::{Picture, Plane, RenderError, Section, Skip, render, section};
+use maille_scene::Scene;
+use maille_volume::BrickSource;
+
+/// Planes of views 1 to 3, in the order of [`maille_contract::messages::VIEWS`].
+const PLANES: [Plane; 3] = [Plane::Axial, Plane::Coronal, Plane::Sagittal];
+
+/// Draws frames into memory of its own.
+pub(crate) struct Composer {
+    skip: Option<Skip>,
+    pictures: [Picture; 4],
+}
+
+impl Composer {
+    pub fn new(scene: &Scene) -> Self {
+        let [w, h] = scene.rendering.size;
+        let [sw, sh] = if scene.has_effect("sections") { scene.rendering.section_size } else { [0, 0] };
+        let section = || Picture::new(sw, sh);
+        Self { skip: None, pictures: [Picture::with_depth(w, h), section(), section(), section()] }
+    }
+
+    /// Bytes of a frame.
+    pub fn bytes(&self) -> usize {
+        self.pictures.iter().map(|p| p.rgb.len()).sum()
+    }
+
+    /// Draws all views from one source.
+    pub fn draw(&mut self, source: &impl BrickSource, view: &View, tool: Option<&ToolState>) -> Result<(), RenderError> {
+        let (camera, at_tip) = view.camera(tool);
+        let settings = view.settings(at_tip);
+        let skip = match &mut self.skip {
+            Some(skip) => {
+                skip.update(source, &settings);
+                skip
+            }
+            empty => empty.insert(Skip::new(source, &settings)),
+        };
+        let [whole, sections @ ..] = &mut self.pictures;
+        render(source, skip, &camera, &settings, whole)?;
+        if let Some(tool) = tool.filter(|_| !at_tip) {
+            overlay::draw_tool(whole, &camera, tool);
+        }
+        let [level, window] = view.window_hu();
+        for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
+            let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
+            let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
+            section(source, &Section { level, window, ..whole }, picture);
+        }
+        Ok(())
+    }
+
+    /// Copies the pictures into a sample and says where they lie.
+    pub fn write(&self, pixels: &mut [u8], stamp: Stamp, epoch: u64, view_sequence: u64, render_ns: u64) -> FrameHeader {
+        let mut header = FrameHeader { stamp, epoch, view_sequence, render_ns, ..FrameHeader::default() };
+        let mut offset = 0;
+        for (picture, rect) in self.pictures.iter().zip(&mut header.views) {
+            let end = offset + picture.rgb.len();
+            pixels[offset..end].copy_from_slice(&picture.rgb);
+            *rect = ViewRect { offset: offset as u64, width: picture.width as u32, height: picture.height as u32 };
+            offset = end;
+        }
+        header
+    }
+}

@@ -1,0 +1,134 @@
+//! From the scene and the page's last word to cameras and settings.
+
+use crate::RenderingError;
+use maille_contract::{ControlBlock, ToolState, ViewState};
+use maille_raycast::{Camera, Light, Preset, Settings, Shading, Step, Transfer};
+use maille_scene::{BoxMm, CameraKind, Mode, Scene};
+
+/// What is to be seen.
+pub(crate) struct View {
+    scene_settings: Settings,
+    scene_camera: Camera,
+    endoscope_fov_deg: f64,
+    endoscope: bool,
+    isosurface: bool,
+    threshold_hu: f64,
+    window_hu: [f64; 2],
+    step: Step,
+    shading: bool,
+    page: Option<ViewState>,
+    generation: u64,
+}
+
+impl View {
+    pub fn new(scene: &Scene, box_mm: &BoxMm) -> Result<Self, RenderingError> {
+        let r = &scene.rendering;
+        let view = r.view(box_mm);
+        Ok(Self {
+            scene_settings: Settings::volume(transfer(&r.transfer)?),
+            scene_camera: Camera { eye: view.eye, target: view.target, up: view.up, fov_deg: view.fov_deg },
+            endoscope_fov_deg: r.endoscope_fov_deg,
+            endoscope: r.camera == CameraKind::Endoscope,
+            isosurface: r.mode == Mode::Isosurface,
+            threshold_hu: scene.deformation.threshold_hu,
+            window_hu: r.section_window_hu,
+            step: Step::Voxels(r.step),
+            shading: r.shading,
+            page: None,
+            generation: 0,
+        })
+    }
+
+    /// Takes the page's latest word; false when it made no sense (then the last one stands).
+    pub fn listen(&mut self, control: &ControlBlock) -> bool {
+        if control.view.generation() == self.generation {
+            return true;
+        }
+        let Some((view, generation)) = control.view.load::<ViewState>() else { return true };
+        self.generation = generation;
+        let checked = view.checked();
+        let sound = checked.is_some();
+        self.page = checked.or(self.page);
+        sound
+    }
+
+    /// Changes whenever the page said something new.
+    pub fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Sequence of the page's view that is shown.
+    pub fn sequence(&self) -> u64 {
+        self.page.map_or(0, |p| p.stamp.sequence)
+    }
+
+    /// Forgets a view that could not be drawn.
+    pub fn fall_back(&mut self, reason: &str) {
+        eprintln!("maille-rendering: the view was refused ({reason}); back to the scene's");
+        self.page = None;
+    }
+
+    fn through_endoscope(&self) -> bool {
+        self.page.map_or(self.endoscope, |p| p.camera == 1)
+    }
+
+    /// The 3D view's camera, and whether it sits at the tool's tip.
+    pub fn camera(&self, tool: Option<&ToolState>) -> (Camera, bool) {
+        match tool {
+            Some(tool) if self.through_endoscope() => {
+                // up of the head, or, looking straight along it, the patient's back
+                let up = if tool.direction[2].abs() > 0.99 { [0.0, -1.0, 0.0] } else { [0.0, 0.0, 1.0] };
+                (Camera::endoscope(tool.tip_mm, tool.direction, up, self.endoscope_fov_deg), true)
+            }
+            _ => match &self.page {
+                Some(p) => (Camera { eye: p.eye_mm, target: p.target_mm, up: p.up, fov_deg: p.fov_deg }, false),
+                None => (self.scene_camera, false),
+            },
+        }
+    }
+
+    /// The 3D view's settings.
+    pub fn settings(&self, at_tip: bool) -> Settings {
+        let threshold = self.page.map_or(self.threshold_hu, |p| p.threshold_hu);
+        let isosurface = self.page.map_or(self.isosurface, |p| p.mode == 1);
+        let mut settings = if isosurface { Settings::isosurface(threshold) } else { self.scene_settings.clone() };
+        if let Some(page) = self.page.filter(|p| p.transfer_count >= 2 && !isosurface) {
+            let points = &page.transfer[..page.transfer_count as usize];
+            settings.transfer.color = points.iter().map(|p| [p[0], p[1], p[2], p[3]]).collect();
+            settings.transfer.opacity = points.iter().map(|p| [p[0], p[4]]).collect();
+        }
+        settings.step = self.step;
+        if !self.shading {
+            settings.shading = None;
+        } else if at_tip {
+            let light = Light::AtEye { half_distance_mm: 40.0 };
+            settings.shading = Some(Shading { light, ..settings.shading.unwrap_or_default() });
+        }
+        settings
+    }
+
+    /// Centre and width of the sections' window (HU).
+    pub fn window_hu(&self) -> [f64; 2] {
+        self.page.map_or(self.window_hu, |p| [p.window_center_hu, p.window_width_hu])
+    }
+
+    /// Position of the section perpendicular to an axis [mm]; `None`: the volume's centre.
+    pub fn section_mm(&self, axis: usize, tool: Option<&ToolState>) -> Option<f64> {
+        match (&self.page, tool) {
+            (Some(p), Some(tool)) if p.sections_follow_tool == 1 => Some(tool.tip_mm[axis]),
+            (Some(p), _) => Some(p.sections_mm[axis]),
+            (None, Some(tool)) => Some(tool.tip_mm[axis]),
+            (None, None) => None,
+        }
+    }
+}
+
+/// A preset, or a file (the supervisor made its path absolute).
+fn transfer(name: &str) -> Result<Transfer, RenderingError> {
+    if let Some(preset) = Preset::from_name(name) {
+        return Ok(preset.transfer());
+    }
+    let fail = |reason: String| RenderingError::Transfer { name: name.into(), reason };
+    let text = std::fs::read_to_string(name).map_err(|e| fail(e.to_string()))?;
+    Transfer::from_text(&text).map_err(|e| fail(e.to_string()))
+}
