@@ -14,7 +14,7 @@ use maille_contract::{
 use maille_raycast::{Preset, Transfer};
 use maille_scene::{BoxMm, CameraKind, Mode, Scene};
 use maille_store::Reader;
-use maille_transport::{ControlMap, Domain, FrameSubscriber, Node, Publisher, Subscriber, monotonic_ns};
+use maille_transport::{Domain, FrameSubscriber, Life, Node, Publisher, Subscriber, monotonic_ns};
 use std::sync::atomic::Ordering::Relaxed;
 
 /// Messages taken in one round: more than come in it, and a bound.
@@ -22,30 +22,26 @@ const MESSAGES_A_ROUND: usize = 256;
 
 /// The console's life: opens what it needs in a domain, serves the page, ends when the run does.
 ///
-/// `parent_pid` is the supervisor that started it, if any; a supervisor that dies stops beating in the control block, and that
-/// ends the console whoever started it.
-///
 /// # Errors
 /// When the domain, its scene or the port cannot be had.
-pub fn run(domain: &str, parent_pid: Option<u32>) -> Result<(), ConsoleError> {
-    let _ = parent_pid;
+pub fn run(domain: &str) -> Result<(), ConsoleError> {
     let domain = Domain::named(domain)?;
-    let control = ControlMap::open(&domain)?;
-    let cell = control.service(Role::Console);
-    cell.set_state(ServiceState::Starting);
-    cell.heartbeat_ns.store(monotonic_ns(), Relaxed);
+    let life = Life::begin(&domain, Role::Console)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| ConsoleError::Scene(e.to_string()))?;
-    let (listener, port) = crate::listen(scene.console.port)?;
-    let quality = scene.console.jpeg_quality;
-    let feed = Live::open(&domain, control, &scene)?;
-    feed.control.console_port.store(u64::from(port), Relaxed);
-    feed.cell().ready_ns.store(monotonic_ns(), Relaxed);
-    feed.cell().set_state(ServiceState::Ready);
-    crate::serve(feed, listener, quality)
+    let mut feed = Live::open(&domain, life, &scene)?;
+    // the port of the console that died: pages that are open find this one
+    let told = u16::try_from(feed.life.control().console_port.load(Relaxed)).unwrap_or(0);
+    let (listener, port) = match scene.console.port {
+        0 => crate::listen(told).or_else(|_| crate::listen(0))?,
+        port => crate::listen(port)?,
+    };
+    feed.life.control().console_port.store(u64::from(port), Relaxed);
+    feed.life.ready();
+    crate::serve(feed, listener, scene.console.jpeg_quality)
 }
 
 struct Live {
-    control: ControlMap,
+    life: Life,
     facts: Facts,
     first_view: ViewState,
     frames: FrameSubscriber,
@@ -57,12 +53,14 @@ struct Live {
     taken: usize,
     frames_counted: u64,
     refused_counted: u64,
+    /// the run stops, or its supervisor has died
+    ended: bool,
     // last: ports go before the node they hang on
     _node: Node,
 }
 
 impl Live {
-    fn open(domain: &Domain, control: ControlMap, scene: &Scene) -> Result<Self, ConsoleError> {
+    fn open(domain: &Domain, life: Life, scene: &Scene) -> Result<Self, ConsoleError> {
         let node = Node::open(domain, Role::Console.word())?;
         let grid = Reader::open(domain, Role::Console).map_err(|e| ConsoleError::Store(e.to_string()))?.info().grid.clone();
         let box_mm = BoxMm::of(&grid);
@@ -81,7 +79,7 @@ impl Live {
             has_tool: scene.tool.is_some(),
         };
         // what the last console said, or the supervisor before the first
-        let told = control.view.load::<ViewState>().and_then(|(view, _)| view.checked());
+        let told = life.control().view.load::<ViewState>().and_then(|(view, _)| view.checked());
         Ok(Self {
             first_view: told.unwrap_or_else(|| scene_view(scene, &box_mm)),
             facts,
@@ -90,16 +88,13 @@ impl Live {
             commits: node.subscriber()?,
             views: node.publisher()?,
             commands: node.publisher()?,
-            control,
+            life,
             taken: 0,
             frames_counted: 0,
             refused_counted: 0,
+            ended: false,
             _node: node,
         })
-    }
-
-    fn cell(&self) -> &ServiceCell {
-        self.control.service(Role::Console)
     }
 
     /// Whether another message may be taken in this round.
@@ -146,7 +141,7 @@ impl Feed for Live {
     }
 
     fn incarnation(&self) -> u64 {
-        self.cell().incarnation.load(Relaxed)
+        self.life.incarnation()
     }
 
     fn now_ns(&self) -> u64 {
@@ -154,7 +149,7 @@ impl Feed for Live {
     }
 
     fn time_ns(&self) -> u64 {
-        self.control.time_ns(monotonic_ns())
+        self.life.control().time_ns(monotonic_ns())
     }
 
     fn frame(&mut self, show: &mut dyn FnMut(&FrameHeader, &[u8])) -> bool {
@@ -173,39 +168,31 @@ impl Feed for Live {
 
     fn services(&mut self) -> Vec<ServiceStatus> {
         let now = monotonic_ns();
-        Role::ALL.into_iter().map(|role| status(role, self.control.service(role), now)).collect()
+        Role::ALL.into_iter().map(|role| status(role, self.life.control().service(role), now)).collect()
     }
 
     fn send_view(&mut self, view: &ViewState) {
-        self.control.view.store(view);
+        self.life.control().view.store(view);
         // a message that could not be sent is not lost: the cell has it, and every reader looks there when it starts
         let _ = self.views.send(view);
     }
 
     fn send_command(&mut self, command: &ToolCommand) {
-        self.control.command.store(command);
+        self.life.control().command.store(command);
         let _ = self.commands.send(command);
     }
 
     fn beat(&mut self, frames: u64, refused: u64) {
         self.taken = 0;
-        let cell = self.control.service(Role::Console);
-        cell.heartbeat_ns.store(monotonic_ns(), Relaxed);
+        self.ended = !self.life.beat(monotonic_ns());
+        let cell = self.life.cell();
         cell.count(Counter::Sent, frames - self.frames_counted);
         cell.count(Counter::Refused, refused - self.refused_counted);
         (self.frames_counted, self.refused_counted) = (frames, refused);
     }
 
     fn should_end(&self) -> bool {
-        self.control.should_end(monotonic_ns())
-    }
-}
-
-impl Drop for Live {
-    fn drop(&mut self) {
-        // a page that is not there any more should not be announced
-        self.control.console_port.store(0, Relaxed);
-        self.cell().set_state(ServiceState::Ended);
+        self.ended
     }
 }
 

@@ -110,7 +110,8 @@ impl<F: Feed> Pump<F> {
         if now >= self.next_services_ns {
             self.next_services_ns = now + SERVICES_EVERY_NS;
             self.services = self.feed.services();
-            self.rates = self.meter.update(now, &self.services);
+            // the time of the counters, not of the round: a rate is only as good as its time
+            self.rates = self.meter.update(self.feed.now_ns(), &self.services);
         }
         self.feed.beat(self.frames, self.hub.refused.load(Relaxed));
         if now >= self.next_state_ns {

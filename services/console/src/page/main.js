@@ -102,8 +102,8 @@ addEventListener("keydown", (e) => {
     r: () => mouse.resetCamera(),
     t: () => tool.toggle(),
     Escape: () => tool.release(),
-    "[": () => model.edit({ threshold_hu: model.view.threshold_hu - 10 }),
-    "]": () => model.edit({ threshold_hu: model.view.threshold_hu + 10 }),
+    "[": () => model.edit({ threshold_hu: model.view.threshold_hu - 10, mode: 1 }),
+    "]": () => model.edit({ threshold_hu: model.view.threshold_hu + 10, mode: 1 }),
     "?": () => $("help").showModal(),
   }[e.key.length === 1 ? e.key.toLowerCase() : e.key];
   if (act) { act(); e.preventDefault(); }

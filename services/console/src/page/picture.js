@@ -10,8 +10,9 @@ export class Picture {
     on("mode-surface", "click", () => ({ mode: 1 }));
     on("camera-free", "click", () => ({ camera: 0 }));
     on("camera-tip", "click", () => ({ camera: 1 }));
-    on("threshold", "input", (e) => ({ threshold_hu: e.valueAsNumber }));
-    on("threshold-number", "change", (e) => ({ threshold_hu: e.valueAsNumber }));
+    // the surface is what shows a threshold, so whoever moves it sees the surface
+    on("threshold", "input", (e) => ({ threshold_hu: e.valueAsNumber, mode: 1 }));
+    on("threshold-number", "change", (e) => ({ threshold_hu: e.valueAsNumber, mode: 1 }));
     on("window-center", "input", (e) => ({ window_center_hu: e.valueAsNumber }));
     on("window-width", "input", (e) => ({ window_width_hu: e.valueAsNumber }));
     on("follow", "change", (e) => ({ sections_follow_tool: e.checked }));

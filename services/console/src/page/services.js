@@ -1,7 +1,11 @@
 // Panel "Services": what runs, and how well.
 
 const $ = (id) => document.getElementById(id);
-const time = (us) => (us >= 1000 ? `${(us / 1000).toFixed(1)} ms` : `${us.toFixed(0)} µs`);
+// Times in one unit, the last one's.
+const times = (...us) => {
+  const ms = us.at(-1) >= 1000;
+  return `${us.map((v) => (ms ? v / 1000 : v)).map((v) => v.toFixed(v < 10 ? 1 : 0)).join(" / ")} ${ms ? "ms" : "µs"}`;
+};
 
 export class Services {
   hello({ facts }) { $("domain").textContent = facts.domain; }
@@ -16,7 +20,7 @@ export class Services {
       cell(s.role, "");
       cell(shown, "state").dataset.state = shown;
       cell(s.pid || "–"); cell(s.restarts);
-      cell(s.p50_us > 0 ? `${time(s.p50_us)} / ${time(s.p99_us)}` : "–").title = s.p50_us > 0 ? `largest ${time(s.max_us)}, ${s.overruns} overruns` : "";
+      cell(s.p50_us > 0 ? times(s.p50_us, s.p99_us) : "–").title = s.p50_us > 0 ? `largest ${times(s.max_us)}, ${s.overruns} overruns` : "";
       return row;
     }));
     $("refused").textContent = state.refused > 0 ? `${state.refused} requests refused` : "";

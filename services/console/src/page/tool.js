@@ -56,6 +56,7 @@ export class Tool {
     if (this.moved && this.model.held) this.say();
     const tool = state?.tool;
     $("hold").disabled = !tool;
+    document.body.dataset.tool = !tool ? "none" : tool.taken_over ? "taken" : "free"; // as the haptic process says
     const pill = $("tool-state");
     [pill.textContent, pill.dataset.state] = !tool ? ["none", "absent"]
       : this.model.held ? ["held here", "held"] : state.held ? ["held by a page", "held"]

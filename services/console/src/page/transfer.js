@@ -6,7 +6,7 @@ import { clamp } from "/geometry.js";
 
 const $ = (id) => document.getElementById(id);
 const KNOTS = [[-1024, 0], [-200, 0.22], [400, 0.68], [1500, 0.9], [3071, 1]];
-const TICKS = [-1000, -500, -200, 0, 200, 400, 1000, 3000];
+const TICKS = [-1000, -200, 0, 200, 400, 1000, 3000];
 const LINE = 15; // pixels for the ticks
 const EDGE = 6;
 const GRIP = 9;
@@ -109,8 +109,8 @@ export class TransferEditor {
     $("transfer-color").disabled = !chosen;
     if (chosen) $("transfer-color").value = `#${chosen.slice(1, 4).map((v) => Math.round(v * 255).toString(16).padStart(2, "0")).join("")}`;
     $("transfer-hint").textContent = chosen ? `${chosen[0]} HU · opacity ${chosen[4].toFixed(3)} over 1 mm` : "Drag points · double-click adds or removes one";
-    const volume = this.model.view?.mode === 0;
-    $("transfer-name").textContent = volume ? "" : "(not used by the surface)";
+    const volume = !this.model.view?.mode;
+    $("transfer-name").textContent = volume ? "" : "volume only";
     const key = JSON.stringify([points, this.chosen, this.model.view?.threshold_hu, this.canvas.clientWidth]);
     if (key !== this.drawn) { this.drawn = key; this.draw(points); }
   }

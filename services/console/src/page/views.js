@@ -30,7 +30,7 @@ export class Views {
   notice() {
     const { model } = this, rendering = model.service("rendering");
     let text = "";
-    if (!model.online) text = "console restarts…";
+    if (!model.online) text = model.facts ? "console restarts…" : "connecting…";
     else if (rendering && rendering.state !== "ready") text = rendering.state === "ended" ? "rendering has ended" : "rendering restarts…";
     else if (performance.now() - model.frameAt > SILENT_MS) text = model.frame ? "waiting for rendering…" : "waiting for the first picture…";
     const shown = text && model.frame ? `${text} last picture shown` : text;
@@ -66,7 +66,7 @@ export class View {
     if (this.isSection) return new SectionMap(this.name, facts.low_mm, facts.high_mm, width, height);
     if (view.camera === 1 && state?.tool) {
       const { tip_mm, direction } = state.tool;
-      const up = Math.abs(direction[2]) > 0.9 ? [0, -1, 0] : [0, 0, 1];
+      const up = Math.abs(direction[2]) > 0.99 ? [0, -1, 0] : [0, 0, 1];
       return new CameraMap({ eye: tip_mm, target: add(tip_mm, direction), up, fov: facts.endoscope_fov_deg }, width, height);
     }
     return new CameraMap({ eye: view.eye_mm, target: view.target_mm, up: view.up, fov: view.fov_deg }, width, height);
@@ -173,9 +173,9 @@ export class View {
     const away = this.isSection ? Math.abs(tool.tip_mm[map.normal] - this.position()) : 0;
     g.globalAlpha = away > 2 * tool.radius_mm ? 0.4 : 1;
     g.strokeStyle = g.fillStyle = colour; g.lineWidth = 1.6;
-    const back = map.pixel(add(tool.tip_mm, tool.direction, -40));
+    const back = this.isSection && map.pixel(add(tool.tip_mm, tool.direction, -40)); // the 3D picture has the shaft itself
     if (back) { g.beginPath(); g.moveTo(x, y); g.lineTo(...screen(back)); g.globalAlpha *= 0.7; g.stroke(); g.globalAlpha /= 0.7; }
-    g.beginPath(); g.arc(x, y, radius, 0, 7); g.stroke();
+    if (this.isSection) { g.beginPath(); g.arc(x, y, radius, 0, 7); g.stroke(); }
     g.beginPath(); g.arc(x, y, 1.5, 0, 7); g.fill();
     // the force on the hand, 10 mm a newton
     const end = map.pixel(add(tool.tip_mm, tool.force_n, 10));
