@@ -45,15 +45,10 @@ pub(crate) fn grid_from_steps(size: [usize; 3], steps: [[f64; 3]; 3], origin: [f
     }
     let mut grid = Grid { size, spacing, origin: origin.map(|o| o + 0.0), direction: [0.0; 9] };
     for (c, step) in steps.iter().enumerate() {
-        // An oblique step is split into length and direction with rounding; fourteen digits of each make the split a
-        // fixed point, so that writing and reading again changes nothing. A step along one axis splits exactly.
-        let oblique = step.iter().filter(|x| **x != 0.0).count() > 1;
-        if oblique {
-            grid.spacing[c] = fourteen_digits(spacing[c]);
-        }
+        let (length, unit) = split(*step);
+        grid.spacing[c] = length;
         for r in 0..3 {
-            let cosine = step[r] / grid.spacing[c] + 0.0;
-            grid.direction[3 * r + c] = if oblique { (cosine * 1e14).round() / 1e14 } else { cosine };
+            grid.direction[3 * r + c] = unit[r];
         }
     }
     checked(grid)
@@ -68,7 +63,19 @@ pub(crate) fn grid_from_parts(size: [usize; 3], spacing: [f64; 3], direction: [f
             "resample it onto a rectangular grid first",
         ));
     }
-    checked(Grid { size, spacing, origin: origin.map(|o| o + 0.0), direction: direction.map(|d| d + 0.0) })
+    let mut grid = Grid { size, spacing, origin: origin.map(|o| o + 0.0), direction: direction.map(|d| d + 0.0) };
+    for (c, axis) in axes.iter().enumerate() {
+        if is_oblique(axis) && spacing[c].is_finite() && spacing[c] > 0.0 {
+            let length = norm(*axis);
+            let scale = if (length - 1.0).abs() < CANONICAL { spacing[c] } else { spacing[c] / length };
+            let (length, unit) = split(axis.map(|x| x * scale));
+            grid.spacing[c] = length;
+            for r in 0..3 {
+                grid.direction[3 * r + c] = unit[r];
+            }
+        }
+    }
+    checked(grid)
 }
 
 fn checked(grid: Grid) -> Parsed<Grid> {
@@ -78,8 +85,24 @@ fn checked(grid: Grid) -> Parsed<Grid> {
     }
 }
 
-fn fourteen_digits(x: f64) -> f64 {
-    format!("{x:.13e}").parse().expect("a printed number parses")
+/// Length and direction below this relative difference are taken as having been split here before.
+const CANONICAL: f64 = 1e-13;
+
+fn is_oblique(step: &[f64; 3]) -> bool {
+    step.iter().filter(|x| **x != 0.0).count() > 1
+}
+
+/// Length and direction of a step, so that splitting their product again gives the same two numbers: writing and reading
+/// must change nothing, and rounding would. A step along one axis splits exactly; of an oblique one, twelve digits of
+/// the length and fourteen decimals of the cosines are kept, far beyond what any scanner knows.
+fn split(step: [f64; 3]) -> (f64, [f64; 3]) {
+    let length = norm(step);
+    if !is_oblique(&step) {
+        return (length, step.map(|x| x / length + 0.0));
+    }
+    let rounded: f64 = format!("{length:.11e}").parse().expect("a printed number parses");
+    let divisor = if (length / rounded - 1.0).abs() < CANONICAL { rounded } else { length };
+    (rounded, step.map(|x| (x / divisor * 1e14).round() / 1e14 + 0.0))
 }
 
 /// Completes one or two given steps with unit steps at right angles to them.

@@ -139,7 +139,8 @@ fn read_file(path: &Path) -> Parsed<Reading> {
         }
         return Err(Fault::NotAVolume("it is compressed, and what is inside is no NIfTI file; unpack it with gunzip first".into()));
     }
-    if nifti::looks_like(&head) {
+    // A DICOM preamble may hold anything, the beginning of an Analyze header among it.
+    if nifti::looks_like(&head) && head.get(128..132) != Some(b"DICM") {
         return nifti::read(path, false);
     }
     if extension == "img" && path.with_extension("hdr").exists() {

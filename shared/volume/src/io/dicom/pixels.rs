@@ -42,7 +42,13 @@ impl Object {
                 if there < expected || there - expected >= (expected / self.planes.len()).max(2) {
                     return Err(Fault::damaged(format!("its header calls for {expected} bytes of pixels, {there} are there")));
                 }
-                (data_set[range.start..range.start + expected].to_vec(), self.syntax.big_endian)
+                let mut bytes = data_set[range.clone()].to_vec();
+                // Bytes written as big-endian words lie swapped in pairs. [PS3.5, section 8.1.2]
+                if self.syntax.big_endian && self.allocated == 8 && self.pixel.words {
+                    bytes.chunks_exact_mut(2).for_each(|pair| pair.swap(0, 1));
+                }
+                bytes.truncate(expected);
+                (bytes, self.syntax.big_endian)
             }
             PixelBytes::Fragments(fragments) => {
                 let packed: usize = fragments.iter().map(|f| f.len()).sum();
@@ -130,12 +136,19 @@ impl Object {
                 continue;
             }
             streams += 1;
-            let Some((precision, rows, columns, samples)) = frame_header(fragment) else { continue };
+            let Some(JpegHeader { precision, rows, columns, samples, lossless, rgb }) = frame_header(fragment) else { continue };
             if (rows, columns, samples) != (self.rows, self.columns, self.samples) {
                 return Err(Fault::damaged(format!(
                     "its attributes tell of {}x{} pixels of {} samples, its JPEG stream of {columns}x{rows} of {samples}",
                     self.columns, self.rows, self.samples
                 )));
+            }
+            // Without a mark of its own a colour stream decodes as YBR, whatever the attributes say.
+            if samples == 3 && !lossless && rgb != (self.photometric == "RGB") {
+                return Err(Fault::unsupported(
+                    format!("its attributes call its colours {}, its JPEG stream does not", self.photometric),
+                    "convert it to an uncompressed transfer syntax",
+                ));
             }
             if precision.next_multiple_of(8) != self.allocated {
                 return Err(Fault::unsupported(
@@ -186,9 +199,20 @@ impl Object {
     }
 }
 
-/// Precision, rows, columns and samples of a JPEG stream's frame header.
-fn frame_header(stream: &[u8]) -> Option<(usize, usize, usize, usize)> {
+/// What a JPEG stream says of itself.
+struct JpegHeader {
+    precision: usize,
+    rows: usize,
+    columns: usize,
+    samples: usize,
+    lossless: bool,
+    /// its colours are marked as RGB, by Adobe's segment or by the names of its components
+    rgb: bool,
+}
+
+fn frame_header(stream: &[u8]) -> Option<JpegHeader> {
     let mut at = 2;
+    let mut adobe_rgb = false;
     loop {
         let &[mark, code, high, low] = stream.get(at..at + 4)?.first_chunk::<4>()?;
         if mark != 0xFF {
@@ -199,10 +223,22 @@ fn frame_header(stream: &[u8]) -> Option<(usize, usize, usize, usize)> {
             continue;
         }
         let length = usize::from(high) << 8 | usize::from(low);
+        if code == 0xEE && stream.get(at + 4..at + 9) == Some(b"Adobe") {
+            adobe_rgb = stream.get(at + 15) == Some(&0);
+        }
         if matches!(code, 0xC0..=0xCF) && !matches!(code, 0xC4 | 0xC8 | 0xCC) {
             let h = stream.get(at + 4..at + 10)?;
             let pair = |n: usize| usize::from(h[n]) << 8 | usize::from(h[n + 1]);
-            return Some((h[0].into(), pair(1), pair(3), h[5].into()));
+            let name = |n: usize| stream.get(at + 10 + 3 * n).copied();
+            let named_rgb = [name(0), name(1), name(2)] == [Some(b'R'), Some(b'G'), Some(b'B')];
+            return Some(JpegHeader {
+                precision: h[0].into(),
+                rows: pair(1),
+                columns: pair(3),
+                samples: h[5].into(),
+                lossless: code == 0xC3,
+                rgb: adobe_rgb || named_rgb,
+            });
         }
         at += 2 + length;
     }

@@ -27,6 +27,8 @@ pub(super) struct Syntax {
 pub(super) struct PixelElement {
     /// 0x0008 float, 0x0009 double, 0x0010 integers
     pub element: u16,
+    /// whether it is written as 16-bit words, whatever the pixels are
+    pub words: bool,
     /// first byte of the element itself: all other elements lie before it
     pub begin: usize,
     /// one past its last byte
@@ -45,6 +47,7 @@ struct Element {
     tag: (u16, u16),
     sequence: bool,
     unknown: bool,
+    words: bool,
     length: u32,
     /// first byte of the value
     value: usize,
@@ -65,7 +68,7 @@ pub(super) fn scan(bytes: &[u8], syntax: Syntax) -> Parsed<Option<PixelElement>>
                 let end = range.end;
                 (PixelBytes::Native(range), end)
             };
-            return Ok(Some(PixelElement { element: element.tag.1, begin, end, data }));
+            return Ok(Some(PixelElement { element: element.tag.1, words: element.words, begin, end, data }));
         }
         at = walk(bytes, &element, bytes.len(), syntax, 0)?;
     }
@@ -88,7 +91,7 @@ fn header(bytes: &[u8], at: usize, syntax: Syntax) -> Parsed<Element> {
         let tag = (u16_at(bytes, at, big)?, u16_at(bytes, at + 2, big)?);
         if tag.0 == 0xFFFE || !syntax.explicit {
             let length = u32_at(bytes, at + 4, big)?;
-            return Some(Element { tag, sequence: false, unknown: false, length, value: at + 8 });
+            return Some(Element { tag, sequence: false, unknown: false, words: true, length, value: at + 8 });
         }
         let vr = bytes.get(at + 4..at + 6)?;
         let short = matches!(
@@ -116,7 +119,7 @@ fn header(bytes: &[u8], at: usize, syntax: Syntax) -> Parsed<Element> {
                 | b"US"
         );
         let (length, value) = if short { (u16_at(bytes, at + 6, big)?.into(), at + 8) } else { (u32_at(bytes, at + 8, big)?, at + 12) };
-        Some(Element { tag, sequence: vr == b"SQ", unknown: vr == b"UN", length, value })
+        Some(Element { tag, sequence: vr == b"SQ", unknown: vr == b"UN", words: vr == b"OW", length, value })
     };
     read().ok_or_else(|| Fault::damaged("it ends within the header of an element"))
 }

@@ -8,7 +8,7 @@ use super::{
     super::{
         Notice, Reading,
         error::{Fault, Parsed},
-        geometry::{SQUARE, cross, dot, grid_from_steps, norm},
+        geometry::{SQUARE, cross, dot, grid_from_parts, norm},
     },
     object::{Object, Plane},
 };
@@ -74,16 +74,15 @@ pub(super) fn assemble(objects: Vec<Object>, decode: &mut dyn FnMut(&Object) -> 
         notices.push(Notice(format!("it does not state its {}", missing.join(", its "))));
     }
     let spacing = spacing.unwrap_or([1.0; 2]);
-    let (row, column) = row.zip(column).unwrap_or(([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]));
-    let normal = {
-        let n = cross(row, column);
-        n.map(|x| x / norm(n))
-    };
+    let unit = |v: [f64; 3]| v.map(|x| x / norm(v));
+    let (row, column) = row.zip(column).map_or(([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), |(r, c)| (unit(r), unit(c)));
+    let normal = unit(cross(row, column));
 
     // Frames in time, or without places: the file's own order.
     let cine =
         objects.len() == 1 && first.cine && first.planes.iter().all(|p| p.position.is_none() || p.position == first.planes[0].position);
-    let between = first.between.or(first.planes[0].thickness);
+    // Thickness is no distance between slices: they may overlap or leave gaps.
+    let between = first.between;
     let mut step = between.unwrap_or(1.0);
     let mut regular = true;
     if !placed && !cine && frames.len() > 1 {
@@ -96,14 +95,13 @@ pub(super) fn assemble(objects: Vec<Object>, decode: &mut dyn FnMut(&Object) -> 
         let gaps: Vec<f64> = frames.windows(2).map(|w| w[1].height - w[0].height).collect();
         step = gaps.iter().sum::<f64>() / gaps.len() as f64;
         regular = check_gaps(&frames, &gaps, step, &objects)?;
-        regular &= drift(&frames, row, column, spacing, normal) <= DRIFT_PIXELS;
+        regular &= drift(&frames, row, column, spacing) <= DRIFT_PIXELS;
     } else if frames.len() == 1 && between.is_none() {
-        notices.push(Notice("it is one slice and does not state its thickness (taken as 1 mm)".into()));
+        notices.push(Notice("it is one slice and does not state the distance to the next (taken as 1 mm)".into()));
     }
 
     let size = [first.columns, first.rows, if cine { 1 } else { frames.len() }];
     let origin = frames[0].plane.position.unwrap_or([0.0; 3]);
-    let scaled = |v: [f64; 3], s: f64| v.map(|x| x * s);
     let (pixels, rescale) = gather(&objects, &frames, decode)?;
     if !regular {
         if first.samples != 1 {
@@ -112,9 +110,14 @@ pub(super) fn assemble(objects: Vec<Object>, decode: &mut dyn FnMut(&Object) -> 
         let stack = Stack { frames: &frames, size, spacing, axes: [row, column, normal], padding: first.padding };
         return stack.resample(pixels, rescale, notices);
     }
-    let grid = grid_from_steps(size, [scaled(row, spacing[0]), scaled(column, spacing[1]), scaled(normal, step)], origin)?;
+    let grid = grid_from_parts(size, [spacing[0], spacing[1], step], direction(&[row, column, normal]), origin)?;
     let image = Image { grid, components: first.samples, frames: if cine { frames.len() } else { 1 }, rescale, pixels };
     Ok(Reading { image, notices, stored_type: None })
+}
+
+/// Direction cosines, row-major, of three axes.
+fn direction(axes: &[[f64; 3]; 3]) -> [f64; 9] {
+    std::array::from_fn(|n| axes[n % 3][n / 3])
 }
 
 /// What all frames state, if any states it; a fault when they contradict one another.
@@ -174,7 +177,7 @@ fn check_gaps(frames: &[Frame], gaps: &[f64], mean: f64, objects: &[Object]) -> 
 }
 
 /// Largest shift within the plane from the first frame [pixels].
-fn drift(frames: &[Frame], row: [f64; 3], column: [f64; 3], spacing: [f64; 2], _normal: [f64; 3]) -> f64 {
+fn drift(frames: &[Frame], row: [f64; 3], column: [f64; 3], spacing: [f64; 2]) -> f64 {
     let origin = frames[0].plane.position.expect("placed");
     frames
         .iter()
@@ -305,11 +308,10 @@ impl Stack<'_> {
             Pixels::I16(_) => Pixels::I16(out.iter().map(|v| v.round() as i16).collect()),
             _ => Pixels::F32(out),
         };
-        let scaled = |v: [f64; 3], s: f64| v.map(|x| x * s);
         let [row, column, normal] = self.axes;
         let (sx, sy) = (self.spacing[0], self.spacing[1]);
         let corner = std::array::from_fn(|n| origin[n] + lowest[0] * sx * row[n] + lowest[1] * sy * column[n]);
-        let grid = grid_from_steps(size, [scaled(row, sx), scaled(column, sy), scaled(normal, step)], corner)?;
+        let grid = grid_from_parts(size, [sx, sy, step], direction(&self.axes), corner)?;
         let tilt = {
             let last = self.frames[self.frames.len() - 1].plane.position.expect("placed");
             let d = [last[0] - origin[0], last[1] - origin[1], last[2] - origin[2]];
