@@ -57,7 +57,7 @@ pub(crate) fn grid_from_steps(size: [usize; 3], steps: [[f64; 3]; 3], origin: [f
 /// A grid whose spacing and direction cosines the file states apart.
 pub(crate) fn grid_from_parts(size: [usize; 3], spacing: [f64; 3], direction: [f64; 9], origin: [f64; 3]) -> Parsed<Grid> {
     let axes: [[f64; 3]; 3] = std::array::from_fn(|c| std::array::from_fn(|r| direction[3 * r + c]));
-    if axes.iter().any(|&a| !((norm(a) - 1.0).abs() < SQUARE)) || !(skew(&axes) < SQUARE) {
+    if !direction.iter().all(|d| d.is_finite()) || axes.iter().any(|&a| (norm(a) - 1.0).abs() >= SQUARE) || skew(&axes) >= SQUARE {
         return Err(Fault::unsupported(
             format!("its direction {direction:?} is not made of unit vectors at right angles"),
             "resample it onto a rectangular grid first",

@@ -9,6 +9,8 @@
 //!
 //! Not here: DICOM writing, lossy compression, pixel types other than those of [`Pixels`](crate::Pixels).
 
+#![expect(clippy::needless_range_loop, reason = "r, c and n are indices into matrices and vectors side by side")]
+
 mod dicom;
 mod error;
 mod geometry;

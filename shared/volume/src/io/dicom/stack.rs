@@ -142,8 +142,8 @@ fn agreed(frames: &[Frame], what: &str, of: impl Fn(&Plane) -> Option<[f64; 3]>)
 /// Whether the gaps are even; a fault when slices coincide or are missing.
 fn check_gaps(frames: &[Frame], gaps: &[f64], mean: f64, objects: &[Object]) -> Parsed<bool> {
     let name = |f: &Frame| objects[f.object].path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    if let Some(n) = gaps.iter().position(|g| !(*g > UNEVEN_MM)) {
-        let count = gaps.iter().filter(|g| !(**g > UNEVEN_MM)).count();
+    if let Some(n) = gaps.iter().position(|g| *g <= UNEVEN_MM) {
+        let count = gaps.iter().filter(|g| **g <= UNEVEN_MM).count();
         return Err(Fault::unsupported(
             format!(
                 "{count} of its {} slices lie where another does (first {} and {})",
