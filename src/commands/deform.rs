@@ -37,7 +37,7 @@ pub struct Args {
     links: Option<PathBuf>,
     /// size of the chain regions: how much neighbours may move against each other, as a part of the voxel spacing
     #[arg(long, default_value_t = 0.2, allow_hyphen_values = true)]
-    offset: f32,
+    offset: f64,
     /// links only between voxels of at least this value [HU]; without it all voxels are linked
     #[arg(long, value_name = "HU", allow_hyphen_values = true)]
     threshold: Option<f64>,
@@ -83,7 +83,7 @@ impl FromStr for Push {
 }
 
 fn triple(text: &str) -> Result<[f64; 3], String> {
-    let mut out = [0.0; 3];
+    let mut out = [0.0f64; 3];
     let parts: Vec<&str> = text.split(',').collect();
     if parts.len() != 3 {
         return Err(format!("`{text}` has {} numbers, three are needed", parts.len()));
@@ -147,7 +147,7 @@ pub fn run(args: &Args) -> Outcome {
 
 fn tissue(args: &Args) -> Result<Tissue, Failure> {
     let tissue = Tissue {
-        offset: args.offset,
+        offset: args.offset as f32,
         density_scaling: args.density_scaling,
         threshold_hu: args.threshold,
         bone_hu: Some(args.bone),
