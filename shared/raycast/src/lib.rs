@@ -26,6 +26,8 @@ mod scalar;
 pub mod section;
 pub mod settings;
 pub mod skip;
+#[cfg(test)]
+mod tests;
 pub mod transfer;
 
 pub use camera::Camera;
