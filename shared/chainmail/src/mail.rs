@@ -103,7 +103,10 @@ impl ChainMail {
     #[inline]
     pub fn displacement(&self, [i, j, k]: [usize; 3]) -> [f32; 3] {
         match self.displacement_brick(self.layout().brick_of(i, j, k)) {
-            Some(brick) => brick.u.map(|plane| plane[DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE)]),
+            Some(brick) => {
+                let n = DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE);
+                [brick.u[0][n], brick.u[1][n], brick.u[2][n]]
+            }
             None => [0.0; 3],
         }
     }
