@@ -1,12 +1,308 @@
-//! `maille render`.
+//! `maille render`: one picture of a volume, or of a scene at rest, without starting any process.
 
 use super::{Failure, Outcome};
+use clap::{Args as ClapArgs, ValueEnum};
+use maille_phantom::{Kind, Phantom};
+use maille_raycast::{Camera, Picture, Plane, Preset, Section, Settings, Skip, Step, Transfer, render, section};
+use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
+use maille_volume::{BrickSource as _, BrickedVolume, Volume, io};
+use std::{
+    fs::File,
+    io::BufWriter,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
-/// Render a picture of a scene or a volume
-#[derive(clap::Args, Default)]
-pub struct Args {}
+/// Render a picture of a scene or a volume into a PNG file
+///
+/// Positions are patient coordinates (LPS) in millimetres. Lists may begin with a minus sign: --eye=-10,20,30.
+#[derive(ClapArgs)]
+pub struct Args {
+    /// a scene (.toml), or a volume: NRRD, MetaImage, NIfTI, or DICOM (a file or a directory)
+    #[arg(value_name = "SCENE|VOLUME")]
+    input: PathBuf,
+    /// the picture to write
+    #[arg(short, long, value_name = "PNG")]
+    output: PathBuf,
+    /// what to show: the 3D view, a section, or a radiograph with the camera of the 3D view
+    #[arg(long, value_enum, default_value_t = View::ThreeD)]
+    view: View,
+    /// pixels across and down [default: the scene's, or 1024x768]
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    size: Option<[usize; 2]>,
+    /// where the eye is [default: in front of the patient]
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true)]
+    eye: Option<[f64; 3]>,
+    /// what the eye looks at [default: the middle of the volume]
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true)]
+    target: Option<[f64; 3]>,
+    /// which way is up in the picture [default: 0,0,1, the head]
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true)]
+    up: Option<[f64; 3]>,
+    /// vertical field of view [default: 30]
+    #[arg(long, value_name = "DEG", value_parser = finite, allow_hyphen_values = true)]
+    fov: Option<f64>,
+    /// transfer function: ct, bone, soft, lung, skin, or a TOML or JSON file [default: the scene's, or ct]
+    #[arg(long, value_name = "TF")]
+    transfer: Option<String>,
+    /// distance between samples along a ray: 0.5mm, or 1vox (smallest spacings) [default: the scene's, or 1vox]
+    #[arg(long, value_name = "1mm|1vox", value_parser = step, allow_hyphen_values = true)]
+    step: Option<Step>,
+    /// show the surface at this value instead of the transfer function
+    #[arg(long, value_name = "HU", value_parser = finite, allow_hyphen_values = true)]
+    iso: Option<f64>,
+    /// colours without light
+    #[arg(long)]
+    no_shade: bool,
+    /// position of a section along its normal [mm, LPS] [default: the middle of the volume]
+    #[arg(long, value_name = "MM", value_parser = finite, allow_hyphen_values = true)]
+    at: Option<f64>,
+    /// grey levels of a section: centre and width [HU] [default: the scene's, or 40,400]
+    #[arg(long, value_name = "CENTRE,WIDTH", value_parser = pair, allow_hyphen_values = true)]
+    window: Option<[f64; 2]>,
+    /// what renders
+    #[arg(long, value_enum, default_value_t = Backend::Cpu)]
+    backend: Backend,
+    /// threads [default: all cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// render this many times and print one JSON object with the time of a frame in milliseconds
+    #[arg(long, value_name = "N")]
+    time: Option<usize>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum View {
+    #[value(name = "3d")]
+    ThreeD,
+    Axial,
+    Coronal,
+    Sagittal,
+    Xray,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Backend {
+    Cpu,
+    Gpu,
+}
 
 /// Runs the command.
-pub fn run(_args: &Args) -> Outcome {
-    Err(Failure::Refused("this command is not built yet".into()))
+pub fn run(args: &Args) -> Outcome {
+    if args.backend == Backend::Gpu {
+        return Err(Failure::Refused("this build has no GPU renderer yet: leave --backend out".into()));
+    }
+    if args.threads == Some(0) || args.time == Some(0) {
+        return Err(Failure::Usage("--threads and --time need at least 1".into()));
+    }
+    let (volume, scene) = load(&args.input)?;
+    let bricks = BrickedVolume::from_volume(&volume);
+    drop(volume);
+    let plane = match args.view {
+        View::ThreeD | View::Xray => None,
+        View::Axial => Some(Plane::Axial),
+        View::Coronal => Some(Plane::Coronal),
+        View::Sagittal => Some(Plane::Sagittal),
+    };
+    let sizes = scene.as_ref().map(|s| if plane.is_some() { s.rendering.section_size } else { s.rendering.size });
+    let [width, height] = args.size.or(sizes).unwrap_or([1024, 768]);
+    let mut picture = Picture::new(width, height);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(args.threads.unwrap_or(0))
+        .build()
+        .map_err(|e| Failure::Refused(format!("no threads to render with: {e}")))?;
+    let frames = args.time.unwrap_or(1);
+    let times = match plane {
+        Some(plane) => {
+            let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
+            timed(frames, || pool.install(|| section(&bricks, &section_of, &mut picture)))
+        }
+        None => {
+            let settings = settings(args, scene.as_ref())?;
+            let camera = camera(args, scene.as_ref(), &bricks)?;
+            let skip = pool.install(|| Skip::new(&bricks, &settings));
+            let mut outcome = Ok(());
+            let times = timed(frames, || outcome = pool.install(|| render(&bricks, &skip, &camera, &settings, &mut picture)));
+            outcome.map_err(|e| Failure::Refused(format!("{}: {e}", args.input.display())))?;
+            times
+        }
+    };
+    if args.time.is_some() {
+        let frame = serde_json::json!({"width": width, "height": height, "frames": frames, "threads": pool.current_num_threads(),
+            "median_ms": times[times.len() / 2], "min_ms": times[0]});
+        println!("{frame}");
+    }
+    write_png(&args.output, &picture)
+}
+
+/// The volume, and the scene if it came from one.
+fn load(path: &Path) -> Result<(Volume, Option<Scene>), Failure> {
+    let is_scene = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml"));
+    if !is_scene {
+        return Ok((read(path)?, None));
+    }
+    let scene = Scene::load(path).map_err(|e| Failure::Report(e.into()))?;
+    let volume = match scene.volume.source() {
+        VolumeSource::File(file) => read(&file)?,
+        VolumeSource::Phantom { kind, size, seed } => {
+            let kind = match kind {
+                PhantomKind::Head => Kind::Head,
+                PhantomKind::Torso => Kind::Torso,
+            };
+            Phantom::new(kind, seed).volume(size)
+        }
+    };
+    Ok((volume, Some(scene)))
+}
+
+fn read(path: &Path) -> Result<Volume, Failure> {
+    let (volume, notices) = io::read_volume(path).map_err(|e| Failure::Refused(e.to_string()))?;
+    for notice in notices {
+        eprintln!("maille: {}: {notice}", path.display());
+    }
+    Ok(volume)
+}
+
+/// What the picture shows: the scene's settings, changed by the options that were given.
+fn settings(args: &Args, scene: Option<&Scene>) -> Result<Settings, Failure> {
+    let rendering = scene.map(|s| &s.rendering);
+    let name = args.transfer.as_deref().or(rendering.map(|r| r.transfer.as_str())).unwrap_or("ct");
+    let iso = args.iso.or_else(|| {
+        let shows_surface = rendering.is_some_and(|r| r.mode == SceneMode::Isosurface) && args.transfer.is_none();
+        scene.filter(|_| shows_surface).map(|s| s.deformation.threshold_hu)
+    });
+    let mut settings = match (args.view, iso) {
+        (View::Xray, _) => Settings::xray(),
+        (_, Some(threshold)) => Settings::isosurface(threshold),
+        _ => Settings::volume(transfer(name)?),
+    };
+    if let Some(rendering) = rendering {
+        settings.step = Step::Voxels(rendering.step);
+        settings.opacity_end = rendering.opacity_end;
+    }
+    if let Some(step) = args.step {
+        settings.step = step;
+    }
+    if args.no_shade || rendering.is_some_and(|r| !r.shading) {
+        settings.shading = None;
+    }
+    Ok(settings)
+}
+
+/// A preset, or the transfer function in a file.
+fn transfer(name: &str) -> Result<Transfer, Failure> {
+    if let Some(preset) = Preset::from_name(name) {
+        return Ok(preset.transfer());
+    }
+    let text = std::fs::read_to_string(name).map_err(|e| {
+        let presets = Preset::ALL.map(Preset::name).join(", ");
+        Failure::Refused(format!("{name} is no preset ({presets}) and cannot be read as a file: {e}"))
+    })?;
+    Transfer::from_text(&text).map_err(|e| Failure::Refused(format!("{name}: {e}")))
+}
+
+/// The camera of the options, over the scene's, over one in front of the patient.
+fn camera(args: &Args, scene: Option<&Scene>, bricks: &BrickedVolume) -> Result<Camera, Failure> {
+    let info = bricks.info();
+    let mut camera = Camera::around(info);
+    if let Some(r) = scene.map(|s| &s.rendering) {
+        let view = r.view(&BoxMm::of(&info.grid));
+        camera = Camera { eye: view.eye, target: view.target, up: view.up, fov_deg: view.fov_deg };
+    }
+    if let Some(fov) = args.fov {
+        let given = Camera { fov_deg: fov, ..camera };
+        if let Some(fault) = given.fault() {
+            return Err(Failure::Usage(fault));
+        }
+        // no eye given: stand where the whole volume fits the new angle
+        camera = if args.eye.is_none() && scene.is_none() { Camera::in_front(info, fov) } else { given };
+    }
+    if let Some(target) = args.target {
+        if args.eye.is_none() {
+            camera.eye = std::array::from_fn(|c| camera.eye[c] + target[c] - camera.target[c]);
+        }
+        camera.target = target;
+    }
+    camera.eye = args.eye.unwrap_or(camera.eye);
+    match args.up {
+        Some(up) => camera.up = up,
+        // looking along the body: the patient's front is up
+        None if camera.fault().is_some() => camera.up = [0.0, -1.0, 0.0],
+        None => {}
+    }
+    match camera.fault() {
+        Some(fault) => Err(Failure::Usage(fault)),
+        None => Ok(camera),
+    }
+}
+
+fn section_settings(args: &Args, scene: Option<&Scene>, bricks: &BrickedVolume, plane: Plane, size: [usize; 2]) -> Section {
+    let mut section = Section::whole(bricks.info(), plane, args.at, size[0], size[1]);
+    if let Some([level, window]) = args.window.or(scene.map(|s| s.rendering.section_window_hu)) {
+        (section.level, section.window) = (level, window);
+    }
+    section
+}
+
+/// Times of several runs [ms], sorted.
+fn timed(frames: usize, mut frame: impl FnMut()) -> Vec<f64> {
+    let mut times: Vec<f64> = (0..frames)
+        .map(|_| {
+            let start = Instant::now();
+            frame();
+            start.elapsed().as_secs_f64() * 1e3
+        })
+        .collect();
+    times.sort_by(f64::total_cmp);
+    times
+}
+
+fn write_png(path: &Path, picture: &Picture) -> Outcome {
+    let write = || -> Result<(), png::EncodingError> {
+        let mut encoder = png::Encoder::new(BufWriter::new(File::create(path)?), picture.width as u32, picture.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let mut writer = encoder.write_header()?;
+        writer.write_image_data(&picture.rgb)?;
+        writer.finish()
+    };
+    write().map_err(|e| Failure::Refused(format!("cannot write {}: {e}", path.display())))
+}
+
+fn finite(text: &str) -> Result<f64, String> {
+    match text.trim().parse::<f64>() {
+        Ok(v) if v.is_finite() => Ok(v),
+        _ => Err(format!("{text} is not a finite number")),
+    }
+}
+
+fn list<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let numbers: Vec<f64> = text.split(',').map(finite).collect::<Result<_, _>>()?;
+    numbers.try_into().map_err(|v: Vec<f64>| format!("{} numbers, {N} are needed, separated by commas", v.len()))
+}
+
+fn triple(text: &str) -> Result<[f64; 3], String> {
+    list(text)
+}
+
+fn pair(text: &str) -> Result<[f64; 2], String> {
+    let [centre, width] = list(text)?;
+    if width > 0.0 { Ok([centre, width]) } else { Err(format!("a width of {width} is not positive")) }
+}
+
+fn size(text: &str) -> Result<[usize; 2], String> {
+    let fault = || format!("{text} is not a size like 800x600, each from 1 to 16384");
+    let (w, h) = text.split_once(['x', 'X']).ok_or_else(fault)?;
+    let [w, h] = [w, h].map(|n| n.parse::<usize>().ok().filter(|n| (1..=16_384).contains(n)));
+    Ok([w.ok_or_else(fault)?, h.ok_or_else(fault)?])
+}
+
+fn step(text: &str) -> Result<Step, String> {
+    let (number, voxels) = match (text.strip_suffix("mm"), text.strip_suffix("vox")) {
+        (Some(n), _) => (n, false),
+        (_, Some(n)) => (n, true),
+        _ => (text, false),
+    };
+    let v = finite(number).ok().filter(|v| *v > 0.0).ok_or(format!("{text} is not a step like 0.5mm or 1vox, above 0"))?;
+    Ok(if voxels { Step::Voxels(v) } else { Step::Millimetres(v) })
 }

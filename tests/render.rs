@@ -1,0 +1,197 @@
+//! `maille render` as a person uses it: files in, a PNG out, exit status as the contract says.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+/// A directory of this test's own, removed at the end.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("maille-render-{name}-{}", std::process::id()));
+        fs::create_dir_all(&path).unwrap();
+        Self(path)
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+fn maille(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_maille")).arg("render").args(arguments).output().unwrap()
+}
+
+/// Renders, and reads the picture back: width, height, RGB.
+fn picture(volume: &Path, out: &Path, arguments: &[&str]) -> (usize, usize, Vec<u8>) {
+    let mut all = vec![volume.to_str().unwrap(), "-o", out.to_str().unwrap()];
+    all.extend(arguments);
+    let output = maille(&all);
+    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(output.stdout.is_empty(), "standard output is for results");
+    let mut reader = png::Decoder::new(std::io::BufReader::new(fs::File::open(out).unwrap())).read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut pixels).unwrap();
+    assert_eq!(info.color_type, png::ColorType::Rgb);
+    (info.width as usize, info.height as usize, pixels)
+}
+
+/// A raw NRRD of 64³ voxels of 1 mm around the origin, from a function of position.
+fn write_nrrd(path: &Path, hu: impl Fn([f64; 3]) -> f64) {
+    let mut bytes = b"NRRD0004\ntype: int16\ndimension: 3\nspace: left-posterior-superior\nsizes: 64 64 64\n\
+        space directions: (1,0,0) (0,1,0) (0,0,1)\nendian: little\nencoding: raw\nspace origin: (-31.5,-31.5,-31.5)\n\n"
+        .to_vec();
+    for n in 0..64 * 64 * 64 {
+        let x = [n % 64, n / 64 % 64, n / 4096].map(|i| i as f64 - 31.5);
+        bytes.extend((hu(x).clamp(-1000.0, 3000.0) as i16).to_le_bytes());
+    }
+    fs::write(path, bytes).unwrap();
+}
+
+fn ball(x: [f64; 3], center: [f64; 3], radius: f64) -> f64 {
+    (radius - (0..3).map(|c| (x[c] - center[c]).powi(2)).sum::<f64>().sqrt()) * 500.0
+}
+
+#[test]
+fn a_ball_has_the_silhouette_that_perspective_gives_it() {
+    let folder = Folder::new("ball");
+    let volume = folder.path("ball.nrrd");
+    write_nrrd(&volume, |x| ball(x, [0.0; 3], 20.0).clamp(-1000.0, 1000.0));
+    let view = ["--eye=0,-200,0", "--target", "0,0,0", "--up=0,0,1", "--fov", "20", "--size", "240x200", "--iso", "0"];
+    let (width, height, rgb) = picture(&volume, &folder.path("ball.png"), &view);
+    assert_eq!((width, height), (240, 200));
+    let seen = rgb.chunks(3).filter(|p| p[0] > 12).count() as f64;
+    let radius = 100.0 * (20f64 / 200.0).asin().tan() / 10f64.to_radians().tan();
+    let measured = (seen / std::f64::consts::PI).sqrt();
+    // the border pixels' share: half a pixel
+    assert!((measured - radius).abs() < 0.6, "{measured} pixels, {radius} expected");
+}
+
+#[test]
+fn the_nearer_of_two_balls_hides_the_other() {
+    let folder = Folder::new("order");
+    let volume = folder.path("two.nrrd");
+    // one far below the background, one far above it: no shell of the one has the colour of the other
+    write_nrrd(&volume, |x| {
+        let near = ball(x, [0.0, -18.0, 0.0], 8.0).clamp(0.0, 1000.0);
+        let far = ball(x, [0.0, 18.0, 0.0], 8.0).clamp(0.0, 1000.0);
+        far - near
+    });
+    let transfer = folder.path("tf.toml");
+    fs::write(&transfer, "color = [[-1, 1, 0, 0], [1, 0, 1, 0]]\nopacity = [[-500, 1], [-300, 0], [300, 0], [500, 1]]\n").unwrap();
+    let red = |eye: &str| {
+        let arguments = [eye, "--target=0,0,0", "--no-shade", "--size=41x41", "--transfer", transfer.to_str().unwrap()];
+        let (_, _, rgb) = picture(&volume, &folder.path("two.png"), &arguments);
+        let at = 3 * (20 * 41 + 20);
+        rgb[at] > 200 && rgb[at + 1] < 50
+    };
+    assert!(red("--eye=0,-200,0"));
+    assert!(!red("--eye=0,200,0"), "from behind, the other one is in front");
+}
+
+#[test]
+fn the_step_hardly_changes_a_smooth_picture() {
+    let folder = Folder::new("step");
+    let volume = folder.path("fog.nrrd");
+    write_nrrd(&volume, |x| (ball(x, [0.0; 3], 25.0) * 0.1).clamp(-1000.0, 150.0));
+    let transfer = folder.path("fog.json");
+    fs::write(&transfer, r#"{"color": [[-500,1,0.8,0.6]], "opacity": [[-400,0],[200,0.05]]}"#).unwrap();
+    let steps: Vec<_> = ["1mm", "0.5vox", "0.25mm"]
+        .iter()
+        .map(|step| {
+            let arguments = ["--no-shade", "--size=80x60", "--step", step, "--transfer", transfer.to_str().unwrap()];
+            picture(&volume, &folder.path("fog.png"), &arguments).2
+        })
+        .collect();
+    assert!(steps[2].iter().any(|&v| v > 100));
+    for coarse in &steps[..2] {
+        let worst = coarse.iter().zip(&steps[2]).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        // half a step of fog of 0.05 at the volume's border is 0.025 of full scale
+        assert!(worst <= 7, "{worst}");
+    }
+}
+
+#[test]
+fn every_view_shows_something() {
+    let folder = Folder::new("views");
+    let volume = folder.path("ball.nrrd");
+    write_nrrd(&volume, |x| ball(x, [0.0; 3], 20.0).clamp(-1000.0, 300.0));
+    for view in ["3d", "axial", "coronal", "sagittal", "xray"] {
+        let (width, height, rgb) = picture(&volume, &folder.path("view.png"), &["--view", view, "--size", "90x70"]);
+        assert_eq!(rgb.len(), 3 * width * height);
+        let bright = rgb.chunks(3).filter(|p| p[0] > 40).count();
+        assert!(bright > 200 && bright < 90 * 70, "{view}: {bright}");
+    }
+    let (_, _, rgb) = picture(&volume, &folder.path("view.png"), &["--view=axial", "--at=-30", "--size=50x50"]);
+    assert!(rgb.iter().all(|&v| v < 40), "below the ball there is air");
+}
+
+#[test]
+fn a_scene_renders_with_its_own_patient_and_camera() {
+    let folder = Folder::new("scene");
+    let scene = folder.path("scene.toml");
+    fs::write(&scene, "[volume]\nphantom = \"head\"\nsize = 48\n\n[rendering]\nsize = [64, 48]\n").unwrap();
+    let (width, height, rgb) = picture(&scene, &folder.path("scene.png"), &[]);
+    assert_eq!((width, height), (64, 48));
+    assert!(rgb.chunks(3).filter(|p| p[0] > 20).count() > 100);
+}
+
+#[test]
+fn what_cannot_be_done_is_one_sentence_and_status_1() {
+    let folder = Folder::new("refused");
+    let (out, text) = (folder.path("out.png"), folder.path("text.nrrd"));
+    let out = out.to_str().unwrap();
+    fs::write(&text, "not a volume").unwrap();
+    let good = folder.path("good.nrrd");
+    write_nrrd(&good, |_| 0.0);
+    let good = good.to_str().unwrap();
+    for arguments in [
+        vec!["/no/such/volume.nrrd", "-o", out],
+        vec![text.to_str().unwrap(), "-o", out],
+        vec![good, "-o", "/no/such/folder/out.png"],
+        vec![good, "-o", out, "--transfer", "no-such-preset"],
+        vec![good, "-o", out, "--backend", "gpu"],
+    ] {
+        let output = maille(&arguments);
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {error}");
+        assert!(error.trim().lines().count() == 1 && !error.contains("panicked"), "{arguments:?}: {error}");
+    }
+}
+
+#[test]
+fn wrong_numbers_are_wrong_use_status_2() {
+    let folder = Folder::new("usage");
+    let volume = folder.path("ball.nrrd");
+    write_nrrd(&volume, |_| 0.0);
+    let out = folder.path("out.png");
+    for wrong in [
+        "--eye=nan,0,0",
+        "--eye=1,2",
+        "--target=inf,0,0",
+        "--fov=180",
+        "--fov=-3",
+        "--step=0",
+        "--step=1foot",
+        "--size=0x10",
+        "--size=big",
+        "--iso=nan",
+        "--view=inside-out",
+    ] {
+        let output = maille(&[volume.to_str().unwrap(), "-o", out.to_str().unwrap(), wrong]);
+        assert_eq!(output.status.code(), Some(2), "{wrong}: {}", String::from_utf8_lossy(&output.stderr));
+        assert!(!out.exists());
+    }
+    let same = ["--eye=1,2,3", "--target=1,2,3"];
+    let output = maille(&[volume.to_str().unwrap(), "-o", out.to_str().unwrap(), same[0], same[1]]);
+    assert_eq!(output.status.code(), Some(2));
+}
