@@ -18,6 +18,9 @@ use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
 /// Pushes shorter than this are not worth a transaction [mm].
 const SHORTEST_PUSH_MM: f64 = 0.01;
 
+/// Value of a voxel that tissue has left (HU): air.
+const VOID_HU: f64 = -1000.0;
+
 /// ChainMail with what a scene says of it.
 pub(crate) struct Engine {
     pub mail: ChainMail,
@@ -60,7 +63,7 @@ impl Engine {
                 Push::Clamp => Admission::ByComponent,
             },
         };
-        let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: None };
+        let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: VOID_HU };
         let state = State { version: VERSION, threshold_hu: d.threshold_hu, last_move: 0, pushes: 0 };
         Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map }
     }

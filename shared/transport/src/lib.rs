@@ -21,6 +21,7 @@ pub mod segment;
 pub use domain::Domain;
 pub use life::Life;
 pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber};
+pub use maille_realtime::monotonic_ns;
 pub use segment::{Access, ControlMap, Segment};
 
 use std::path::PathBuf;
@@ -49,11 +50,4 @@ pub enum TransportError {
     Layout { segment: String, reason: String },
     #[error("iceoryx2 could not {action}: {reason}")]
     Iceoryx { action: String, reason: String },
-}
-
-/// CLOCK_MONOTONIC [ns].
-#[inline]
-pub fn monotonic_ns() -> u64 {
-    let t = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    t.tv_sec as u64 * 1_000_000_000 + t.tv_nsec as u64
 }
