@@ -1,0 +1,55 @@
+//! The bytes that two processes see, pinned: names, sizes and offsets. iceoryx2 compares name, size and alignment only, so two
+//! fields that change places under one name would pass unnoticed. A failure here means: raise the version in the name,
+//! then write the new numbers down.
+
+use iceoryx2::prelude::ZeroCopySend;
+use maille_contract::{
+    Commit, ControlBlock, FrameHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState,
+    index::{ChannelLayout, IndexHeader, IndexLayout, SlotRecord},
+    messages::ViewRect,
+};
+use std::mem::{align_of, offset_of, size_of};
+
+fn name<T: ZeroCopySend>() -> &'static str {
+    // SAFETY: the derived function returns a string literal; it is unsafe only for those who implement it.
+    unsafe { <T as ZeroCopySend>::type_name() }
+}
+
+macro_rules! golden {
+    ($t:ty, $size:expr, $($field:ident: $offset:expr),*) => {
+        assert_eq!((size_of::<$t>(), align_of::<$t>()), ($size, 8), stringify!($t));
+        $(assert_eq!(offset_of!($t, $field), $offset, concat!(stringify!($t), ".", stringify!($field)));)*
+    };
+}
+
+macro_rules! message {
+    ($t:ty, $name:literal, $size:expr, $($field:ident: $offset:expr),*) => {
+        assert_eq!(name::<$t>(), $name);
+        golden!($t, $size, $($field: $offset),*);
+    };
+}
+
+#[test]
+fn messages_keep_their_names_sizes_and_offsets() {
+    message!(Stamp, "maille.Stamp/v1", 24, time_ns: 0, sequence: 8, incarnation: 16);
+    message!(ToolState, "maille.ToolState/v1", 152, stamp: 0, tip_mm: 24, proxy_mm: 48, direction: 72, force_n: 96, penetration_mm: 120, radius_mm: 128, flags: 136, epoch: 144);
+    message!(ToolMove, "maille.ToolMove/v1", 136, stamp: 0, tip_mm: 24, outside_mm: 48, contact_mm: 72, normal: 96, depth_mm: 120, radius_mm: 128);
+    message!(Commit, "maille.Commit/v1", 88, stamp: 0, epoch: 24, cause: 32, moved_elements: 40, bricks: 48, step_ns: 56, refused_mm: 64);
+    message!(ViewState, "maille.ViewState/v1", 664, stamp: 0, threshold_hu: 24, mode: 32, camera: 40, eye_mm: 48, target_mm: 72, up: 96, fov_deg: 120, window_center_hu: 128,
+        window_width_hu: 136, sections_mm: 144, sections_follow_tool: 168, transfer_count: 176, transfer: 184);
+    message!(ToolCommand, "maille.ToolCommand/v1", 64, stamp: 0, taken: 24, target_mm: 32, sent_ns: 56);
+    message!(ViewRect, "maille.ViewRect/v1", 16, offset: 0, width: 8, height: 12);
+    message!(FrameHeader, "maille.FrameHeader/v1", 112, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, views: 48);
+}
+
+#[test]
+fn shared_words_keep_their_sizes_and_offsets() {
+    golden!(ServiceCell, 18_624, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 176, lateness: 9_400);
+    assert_eq!((offset_of!(ControlBlock, magic), align_of::<ControlBlock>()), (0, 64));
+    assert_eq!(offset_of!(ControlBlock, size_bytes), 8);
+    assert_eq!(offset_of!(ControlBlock, pins) % 64, 0);
+    golden!(ChannelLayout, 24, entry_count: 0, slot_count: 8, slot_bytes: 16);
+    golden!(SlotRecord, 16, born: 0, superseded: 8);
+    golden!(IndexLayout, 288, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 264, root_count: 272, leaf_count: 280);
+    golden!(IndexHeader, 24 + size_of::<IndexLayout>(), magic: 0, checksum: 8, layout: 16);
+}
