@@ -69,7 +69,8 @@ fn a_fault_is_shown_on_its_line_with_a_suggestion_and_exit_status_1() {
     let scene = File::new("fault", "name = \"fault\"\n\n[deformation]\ntreshold_hu = -300\n");
     let output = check(&[scene.path()]);
     assert_eq!(output.status.code(), Some(1));
-    let said = String::from_utf8(output.stderr).unwrap();
+    // the report is wrapped to the terminal's width: put its sentences together again
+    let said = String::from_utf8(output.stderr).unwrap().replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ");
     for word in ["treshold_hu = -300", "did you mean `threshold_hu`?", ":4"] {
         assert!(said.contains(word), "{word} is not in\n{said}");
     }

@@ -11,7 +11,14 @@ use maille_store::{StorePlan, StoreSizes};
 use maille_supervisor::memory::shared_memory_space;
 use maille_volume::{Rescale, Volume, VolumeInfo, io};
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::{io::Write as _, path::PathBuf};
+
+/// Prints a line; a reader that went away (`maille check | head`) is no reason to fail.
+macro_rules! say {
+    ($($word:tt)*) => {{
+        let _ = writeln!(std::io::stdout(), $($word)*);
+    }};
+}
 
 /// Print the plan of a scene: processes, effects, memory, rates
 ///
@@ -45,7 +52,7 @@ pub fn run(args: &Args) -> Outcome {
     let way = scene.resolve_path(&BoxMm::of(grid), |at| patient.value(at)).map_err(report)?;
     let memory = Memory::of(&plan, patient.info());
     if args.json {
-        println!("{}", json_of(&scene, &patient, &plan, way.as_ref(), &memory));
+        say!("{}", json_of(&scene, &patient, &plan, way.as_ref(), &memory));
     } else {
         print_text(&scene, &patient, &plan, way.as_ref(), &memory);
     }
@@ -156,8 +163,8 @@ fn ends(way: &Waypoints) -> ([f64; 3], [f64; 3]) {
 fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoints>, memory: &Memory) {
     let grid = &patient.info().grid;
     let triple = |v: [f64; 3], digits: usize| format!("{:.digits$}, {:.digits$}, {:.digits$}", v[0], v[1], v[2]);
-    println!("scene        {}: {}", scene.name, scene.description);
-    println!(
+    say!("scene        {}: {}", scene.name, scene.description);
+    say!(
         "volume       {}: {} × {} × {} voxels of {} mm, {} bricks",
         patient.name(),
         grid.size[0],
@@ -169,7 +176,7 @@ fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoi
     if let (Some(tool), Some(way)) = (&scene.tool, way) {
         let (start, end) = ends(way);
         let device = String::from(tool.device.clone());
-        println!(
+        say!(
             "tool         sphere of {} mm moved by `{device}`, round of {:.1} s, from ({}) to ({}) mm",
             tool.radius_mm,
             way.period_s(),
@@ -177,30 +184,30 @@ fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoi
             triple(end, 1)
         );
     }
-    println!("\nprocesses");
+    say!("\nprocesses");
     for p in &plan.processes {
         let rate = p.rate_hz.map_or("on events".into(), |hz| format!("{hz} Hz"));
         let stages: Vec<&str> = p.stages.iter().map(|s| s.name).collect();
         let threads = if p.threads == 1 { "1 thread ".into() } else { format!("{} threads", p.threads) };
-        println!("  {:<20} {rate:>9}  {threads:<11} {}", p.process.name(), stages.join(", "));
+        say!("  {:<20} {rate:>9}  {threads:<11} {}", p.process.name(), stages.join(", "));
     }
-    println!("\neffects");
+    say!("\neffects");
     for e in &plan.effects {
-        println!("  {:<20} {}", e.name, e.summary);
+        say!("  {:<20} {}", e.name, e.summary);
     }
-    println!("\nshared memory");
+    say!("\nshared memory");
     for (name, bytes, meaning) in &memory.segments {
-        println!("  {name:<20} {:>9.1} MiB  {meaning}", mib(*bytes));
+        say!("  {name:<20} {:>9.1} MiB  {meaning}", mib(*bytes));
     }
     let free = memory.free.map_or(String::new(), |free| format!("  of {:.1} MiB free in /dev/shm", mib(free)));
-    println!("  {:<20} {:>9.1} MiB{free}", "total", mib(memory.total()));
+    say!("  {:<20} {:>9.1} MiB{free}", "total", mib(memory.total()));
     if plan.dirty_bricks > 0 {
-        println!("  ({} readers; one commit rewrites at most {} bricks)", plan.readers, plan.dirty_bricks);
+        say!("  ({} readers; one commit rewrites at most {} bricks)", plan.readers, plan.dirty_bricks);
     }
-    println!("\nknobs (accuracy = \"{}\")", scene.accuracy.name());
+    say!("\nknobs (accuracy = \"{}\")", scene.accuracy.name());
     for (knob, value) in &plan.knobs {
-        println!("  {:<36} {}", knob.name, knob_text(knob, *value));
-        println!("  {:<36}   {}; error: {}", "", knob.summary, knob.error);
+        say!("  {:<36} {}", knob.name, knob_text(knob, *value));
+        say!("  {:<36}   {}; error: {}", "", knob.summary, knob.error);
     }
 }
 

@@ -14,7 +14,8 @@ pub struct SceneError {
     #[help]
     help: Option<String>,
     #[source_code]
-    text: Option<NamedSource<Arc<str>>>,
+    // behind a pointer, so that a `Result` of it stays small
+    text: Option<Arc<NamedSource<Arc<str>>>>,
     #[label(collection)]
     labels: Vec<LabeledSpan>,
     #[related]
@@ -53,7 +54,7 @@ impl Source {
                 sentence: format!("{place}: {}", fault.message),
                 help: fault.help,
                 labels: fault.span.map(|span| LabeledSpan::new_with_span(Some(fault.label), span)).into_iter().collect(),
-                text: Some(NamedSource::new(&self.name, self.text.clone())),
+                text: Some(Arc::new(NamedSource::new(&self.name, self.text.clone()))),
                 others: Vec::new(),
             }
         });

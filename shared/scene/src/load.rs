@@ -227,7 +227,7 @@ fn of_toml(e: &toml::de::Error) -> Fault {
 
 /// NaN is in no range.
 fn out_of(value: f64, low: f64, high: f64) -> bool {
-    !(value >= low && value <= high)
+    !(low..=high).contains(&value)
 }
 
 fn check_range(document: &Document, path: &str, value: f64, [low, high]: [f64; 2], unit: &str, faults: &mut Vec<Fault>) {
@@ -352,7 +352,7 @@ fn check_tissues(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     for (n, row) in scene.tissues.iter().enumerate() {
         let at = |field: &str| format!("tissue.{n}.{field}");
         let name = &row.name;
-        if !(row.hu[0] < row.hu[1]) || !row.hu.iter().all(|v| v.is_finite()) {
+        if !row.hu.iter().all(|v| v.is_finite()) || row.hu[0] >= row.hu[1] {
             faults.push(document.fault(&at("hu"), format!("tissue `{name}` has no range"), "low must be below high", None));
         } else if row.hu[0] < top {
             let message = format!("tissue `{name}` begins at {} HU, inside the row before it (up to {top})", row.hu[0]);
