@@ -1,0 +1,190 @@
+//! The page of a real run in a headless Chromium: four pictures that live, the threshold, the tool, a rendering process killed.
+//!
+//! Skips loudly where Chromium is missing; in CI (`CI` set) it must be there.
+
+mod browser;
+
+use browser::{Browser, chromium};
+use serde_json::Value;
+use std::{
+    io::{BufRead, BufReader},
+    process::{Child, Command, Stdio},
+    sync::mpsc,
+    time::{Duration, Instant},
+};
+
+/// Longest wait for a run to start (it makes its patient first) or to end.
+const PATIENCE: Duration = Duration::from_secs(180);
+
+/// `maille run` with its page, ended by SIGTERM when dropped.
+struct Run {
+    child: Child,
+    address: String,
+}
+
+impl Run {
+    fn start() -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_maille"))
+            .args(["run", "--duration", "300s"])
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("maille starts");
+        let out = BufReader::new(child.stdout.take().expect("its output"));
+        let (sender, lines) = mpsc::channel();
+        std::thread::spawn(move || out.lines().map_while(Result::ok).for_each(|line| _ = sender.send(line)));
+        let start = Instant::now();
+        let mut said = Vec::new();
+        while let Ok(line) = lines.recv_timeout(PATIENCE.saturating_sub(start.elapsed())) {
+            if let Some(at) = line.find("http://127.0.0.1:") {
+                return Self { child, address: line[at..].split_whitespace().next().expect("an address").to_owned() };
+            }
+            said.push(line);
+        }
+        signal("TERM", child.id());
+        let _ = child.wait();
+        panic!("maille run printed no address; it said: {said:?}")
+    }
+
+    /// Ends it as Ctrl-C would, and waits.
+    fn end(mut self) {
+        signal("TERM", self.child.id());
+        let start = Instant::now();
+        while start.elapsed() < PATIENCE {
+            if let Ok(Some(status)) = self.child.try_wait() {
+                assert!(status.success(), "maille run ended with {status}");
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        panic!("maille run did not end");
+    }
+}
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        if matches!(self.child.try_wait(), Ok(None)) {
+            signal("TERM", self.child.id());
+            let _ = self.child.wait();
+        }
+    }
+}
+
+fn signal(name: &str, pid: u32) {
+    let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).status();
+    assert!(sent.is_ok(), "no `kill` command");
+}
+
+/// Helpers in the page: pixels of a view as grey values, and how much two pictures differ.
+const HELPERS: &str = "
+    window.grey = (view) => {
+        const c = document.getElementById(`image-${view}`), d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        return Array.from({length: d.length / 4}, (_, i) => (d[4 * i] + d[4 * i + 1] + d[4 * i + 2]) / 3);
+    };
+    window.changed = (a, b) => a.filter((v, i) => Math.abs(v - b[i]) > 24).length / a.length;
+    window.spread = (a) => Math.max(...a.filter((_, i) => i % 7 === 0)) - Math.min(...a.filter((_, i) => i % 7 === 0));
+    true";
+
+fn number(value: Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+/// Waits for a number of further frames.
+fn frames(browser: &mut Browser, count: u32) {
+    let now = number(browser.evaluate("Number(document.body.dataset.frames)"));
+    browser.until("new frames", &format!("Number(document.body.dataset.frames) >= {}", now + f64::from(count)));
+}
+
+/// Middle of an element.
+fn middle(browser: &mut Browser, id: &str) -> [f64; 2] {
+    let rect = browser.evaluate(&format!(
+        "(() => {{ const r = document.getElementById('{id}').getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"
+    ));
+    [number(rect[0].clone()), number(rect[1].clone())]
+}
+
+fn click(browser: &mut Browser, id: &str) {
+    let at = middle(browser, id);
+    browser.drag(at, at, "left", 0);
+}
+
+#[test]
+fn the_page_lives_obeys_and_survives_a_killed_rendering() {
+    let Some(chromium) = chromium() else {
+        assert!(std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
+        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
+        return;
+    };
+    let run = Run::start();
+    let mut browser = Browser::open(&chromium, &run.address, 1600, 900);
+    browser.until("the first frame", "Number(document.body?.dataset.frames ?? 0) >= 2");
+    browser.evaluate(HELPERS);
+
+    // four pictures, none of them flat; the 3D view changes as the tool moves, each section as the wheel goes through the slices
+    // (by itself a section in the plane of the tool's way stands still once the tissue has given way)
+    for view in ["3d", "axial", "coronal", "sagittal"] {
+        assert!(number(browser.evaluate(&format!("spread(grey('{view}'))"))) > 60.0, "the {view} view is flat");
+        browser.evaluate(&format!("window.before = grey('{view}'); true"));
+        if view != "3d" {
+            let at = middle(&mut browser, &format!("image-{view}"));
+            (0..10).for_each(|_| browser.wheel(at, 100.0));
+        }
+        browser.until(&format!("a change in the {view} view"), &format!("changed(before, grey('{view}')) > 0"));
+    }
+    click(&mut browser, "follow");
+    browser.until("sections that follow the tool again", "document.getElementById('follow').checked");
+
+    // the surface at the threshold, moved by dragging the slider from skin to bone
+    click(&mut browser, "mode-surface");
+    frames(&mut browser, 6);
+    browser.evaluate("window.skin = grey('3d'); true");
+    frames(&mut browser, 6);
+    let by_itself = number(browser.evaluate("changed(skin, grey('3d'))"));
+    let slider = browser.evaluate(
+        "(() => { const e = document.getElementById('threshold'), r = e.getBoundingClientRect();
+            const at = (hu) => [r.x + 8 + (r.width - 16) * (hu - e.min) / (e.max - e.min), r.y + r.height / 2];
+            return [at(e.valueAsNumber), at(350)]; })()",
+    );
+    let point = |n: usize| [number(slider[n][0].clone()), number(slider[n][1].clone())];
+    browser.drag(point(0), point(1), "left", 0);
+    assert!(number(browser.evaluate("document.getElementById('threshold').valueAsNumber")) > 150.0, "the slider did not move");
+    frames(&mut browser, 6);
+    let by_threshold = number(browser.evaluate("changed(skin, grey('3d'))"));
+    // the tool's own motion changes a percent or so; another surface changes most of the head
+    assert!(by_threshold > 0.05 && by_threshold > 3.0 * by_itself, "by the threshold {by_threshold}, without it {by_itself}");
+
+    // the camera turns
+    browser.evaluate("window.bone = grey('3d'); true");
+    let at = middle(&mut browser, "image-3d");
+    browser.drag(at, [at[0] + 150.0, at[1]], "left", 0);
+    frames(&mut browser, 6);
+    assert!(number(browser.evaluate("changed(bone, grey('3d'))")) > 0.05, "the camera did not turn");
+
+    // the tool is taken, dragged to another place, and let go; the haptic process says so itself
+    let state =
+        |browser: &mut Browser, word: &str| browser.until(&format!("tool {word}"), &format!("document.body.dataset.tool === '{word}'"));
+    state(&mut browser, "free");
+    click(&mut browser, "hold");
+    state(&mut browser, "taken");
+    let tip = "document.getElementById('tool-tip').textContent";
+    browser.evaluate(&format!("window.tip = {tip}; true"));
+    let at = middle(&mut browser, "image-axial");
+    browser.drag(at, [at[0] + 25.0, at[1]], "left", 0);
+    browser.until("the tip elsewhere", &format!("parseFloat({tip}) - parseFloat(tip) > 5"));
+    click(&mut browser, "hold");
+    state(&mut browser, "free");
+
+    // kill -9: the page says so or not (it may be back at once), and goes on
+    let row = "document.querySelector('#services tbody').rows[2].cells";
+    let pid = number(browser.evaluate(&format!("Number({row}[2].textContent)")));
+    signal("KILL", pid as u32);
+    browser.until("one restart", &format!("{row}[3].textContent === '1' && {row}[1].textContent === 'ready'"));
+    frames(&mut browser, 3);
+
+    // nothing from elsewhere, nothing in the browser's log
+    let foreign =
+        browser.evaluate("performance.getEntriesByType('resource').map((e) => e.name).filter((n) => !n.startsWith(location.origin))");
+    assert_eq!(foreign.as_array().map(Vec::len), Some(0), "{foreign}");
+    assert_eq!(browser.complaints, Vec::<String>::new());
+    drop(browser);
+    run.end();
+}
