@@ -1,7 +1,7 @@
 //! Memory: what /dev/shm has left, what a process holds for itself, what a domain's segments take.
 
 use crate::SupervisorError;
-use std::{fs, path::Path};
+use std::{collections::BTreeMap, fs, path::Path};
 
 /// Where shared memory lives on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";
@@ -45,20 +45,17 @@ fn private_dirty_kib(rollup: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// Bytes of the segments `/dev/shm/<domain>_<segment>`, by segment. Files of iceoryx2's own lie in the domain's
-/// directory and under names with further parts; they are counted under the name they have.
-pub fn segments(domain: &str) -> Vec<(String, u64)> {
+/// Bytes of a domain in /dev/shm by segment, our own by their names; what iceoryx2 made for its messages, whose names have
+/// endings, counts as `messages`.
+pub fn segments(domain: &str) -> BTreeMap<String, u64> {
     let prefix = format!("{domain}_");
-    let Ok(entries) = fs::read_dir(Path::new(SHARED_MEMORY)) else { return Vec::new() };
-    let mut found: Vec<(String, u64)> = entries
-        .flatten()
-        .filter_map(|entry| {
-            let name = entry.file_name().into_string().ok()?;
-            let segment = name.strip_prefix(&prefix)?.to_owned();
-            Some((segment, entry.metadata().ok()?.len()))
-        })
-        .collect();
-    found.sort();
+    let mut found = BTreeMap::new();
+    for entry in fs::read_dir(Path::new(SHARED_MEMORY)).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let Some(segment) = name.to_str().and_then(|name| name.strip_prefix(&prefix)) else { continue };
+        let segment = if segment.contains('.') { "messages" } else { segment };
+        *found.entry(segment.to_owned()).or_default() += entry.metadata().map_or(0, |m| m.len());
+    }
     found
 }
 

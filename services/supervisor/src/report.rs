@@ -23,7 +23,7 @@
 //! | `services.rendering.frames`, `rate_hz`, `frame_ms` | frames after warm-up; a second; time of one |
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
-//! | `store.segments_mib` | the same by segment |
+//! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
 use crate::{memory::MIB, watch::Post};
@@ -189,7 +189,7 @@ fn own(role: Role, cell: &ServiceCell) -> Own {
 
 impl StoreReport {
     /// The numbers of the store. `spare_slots_low` is a word that its writer has not lowered yet while it is all ones.
-    pub(crate) fn of(voxels: usize, segments: &[(String, u64)], spare_slots: u64, spare_slots_low: u64) -> Self {
+    pub(crate) fn of(voxels: usize, segments: &BTreeMap<String, u64>, spare_slots: u64, spare_slots_low: u64) -> Self {
         let segments_mib: BTreeMap<_, _> = segments.iter().map(|(name, bytes)| (name.clone(), *bytes as f64 / MIB)).collect();
         Self {
             voxels_mib: 2.0 * voxels as f64 / MIB,
@@ -250,7 +250,7 @@ mod tests {
 
     fn report(control: &ControlBlock) -> serde_json::Value {
         let services = Role::ALL.map(|role| (role.word().to_owned(), ServiceReport::of(control, &Post::new(role, false), false)));
-        let store = StoreReport::of(1 << 20, &[("rest".into(), 3 << 20), ("control".into(), 1 << 20)], 10, u64::MAX);
+        let store = StoreReport::of(1 << 20, &[("rest".to_owned(), 3 << 20), ("control".to_owned(), 1 << 20)].into(), 10, u64::MAX);
         let report = RunReport { services: services.into(), store, ..RunReport::default() };
         assert!(report.to_string().contains("haptic tick µs"));
         serde_json::to_value(report).unwrap()
