@@ -44,7 +44,7 @@ pub const MAX_REQUEST_BYTES: usize = 16 << 10;
 #[serde(tag = "type", rename_all = "lowercase")]
 pub enum Request {
     /// change what the views show
-    View(ViewPatch),
+    View(Box<ViewPatch>),
     /// take, move or let go the tool
     Tool(ToolRequest),
     /// a frame was drawn
