@@ -8,7 +8,7 @@
 pub fn intersection_search(is_tissue: impl Fn([f64; 3]) -> bool, from: [f64; 3], to: [f64; 3], step_mm: f64) -> Option<[f64; 3]> {
     let path: [f64; 3] = std::array::from_fn(|c| from[c] - to[c]);
     let length = path.iter().map(|v| v * v).sum::<f64>().sqrt();
-    if !(length.is_finite() && step_mm > 0.0) || !is_tissue(to) {
+    if !(length.is_finite() && step_mm > 0.0 && is_tissue(to)) {
         return None;
     }
     let at = |t: f64| std::array::from_fn(|c| to[c] + path[c] * t);

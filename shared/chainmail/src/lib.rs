@@ -24,7 +24,7 @@
 //! Invariants: after every push all links hold up to rounding (a few ulp of |u|), bone has u = 0 bit for bit, |u_c| ≤ m. Subtraction of
 //! floats is monotone, so the result is the same bits whatever the order of propagation.
 //! Cost: in proportion to the moved elements, in bricks on demand. Not here: voxels ([`maille_mapper`] rewrites them),
-//! relaxation, cuts.
+//! cuts.
 //!
 //! [`maille_mapper`]: https://docs.rs/maille-mapper
 
@@ -37,6 +37,7 @@ mod intersection;
 mod mail;
 mod propagate;
 mod region;
+mod relax;
 mod state;
 mod tile;
 mod tissue;

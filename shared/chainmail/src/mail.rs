@@ -117,6 +117,12 @@ impl ChainMail {
         self.elements.slot(id).map(|slot| &self.elements.brick(slot).displacement)
     }
 
+    /// The displacements of a loaded brick, to be changed.
+    pub(crate) fn displacement_planes_mut(&mut self, id: BrickId) -> &mut [[f32; ELEMENTS]; 3] {
+        let slot = self.elements.load(id);
+        &mut self.elements.brick_mut(slot).displacement.u
+    }
+
     /// Bricks that hold displacements (perhaps all zero), ascending.
     pub fn loaded_bricks(&self) -> Vec<BrickId> {
         let mut ids: Vec<BrickId> = self.elements.bricks().iter().map(|b| b.id).collect();
@@ -203,9 +209,9 @@ impl ChainMail {
                 scale_along_motion(&here, &targets, &mut admissible);
             }
             self.before.restore(&mut self.elements);
-            for c in 0..3 {
+            for (c, plane) in admissible.iter().enumerate() {
                 for sign in [1.0, -1.0] {
-                    sweeps += self.propagate(rest, &voxels, &here, &admissible[c], c, sign).1;
+                    sweeps += self.propagate(rest, &voxels, &here, plane, c, sign).1;
                 }
             }
         }
@@ -321,7 +327,7 @@ impl ChainMail {
 }
 
 /// Row spans of the elements of a brick for which `changed` holds, and their number.
-fn spans(id: BrickId, changed: impl Fn(usize) -> bool) -> (ChangedBrick, u64) {
+pub(crate) fn spans(id: BrickId, changed: impl Fn(usize) -> bool) -> (ChangedBrick, u64) {
     let (mut out, mut count) = (ChangedBrick::new(id), 0);
     for n in 0..ELEMENTS {
         if changed(n) {

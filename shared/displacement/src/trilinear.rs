@@ -7,13 +7,13 @@ use crate::FieldSample;
 #[inline]
 pub fn trilinear(corners: &[[f32; 3]; 8], f: [f32; 3]) -> FieldSample {
     let mut out = FieldSample::ZERO;
-    for c in 0..3 {
+    for (c, u) in out.u.iter_mut().enumerate() {
         let v = |n: usize| corners[n][c];
         // differences along i on the four edges, then blended
         let (d0, d1, d2, d3) = (v(1) - v(0), v(3) - v(2), v(5) - v(4), v(7) - v(6));
         let (e0, e1, e2, e3) = (v(0) + d0 * f[0], v(2) + d1 * f[0], v(4) + d2 * f[0], v(6) + d3 * f[0]);
         let (g0, g1) = (e0 + (e1 - e0) * f[1], e2 + (e3 - e2) * f[1]);
-        out.u[c] = g0 + (g1 - g0) * f[2];
+        *u = g0 + (g1 - g0) * f[2];
         let (x0, x1) = (d0 + (d1 - d0) * f[1], d2 + (d3 - d2) * f[1]);
         out.jacobian[c] = [x0 + (x1 - x0) * f[2], (e1 - e0) + ((e3 - e2) - (e1 - e0)) * f[2], g1 - g0];
     }

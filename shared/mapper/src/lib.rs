@@ -93,7 +93,7 @@ where
                 wanted.insert(id, spans);
                 continue;
             };
-            for (to, from) in merged.iter_mut().zip(spans.iter().filter(|_| true)) {
+            for (to, from) in merged.iter_mut().zip(spans.iter()) {
                 if from[1] > 0 {
                     *to = if to[1] == 0 { *from } else { [to[0].min(from[0]), to[1].max(from[1])] };
                 }

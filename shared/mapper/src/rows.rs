@@ -86,7 +86,8 @@ fn cover_run(
     let mut range = Box3 { low: [0; 3], high: [0; 3] };
     for c in 0..3 {
         let (a, b) = ((low[c] - slack).ceil().max(0.0), (high[c] + slack).floor().min((layout.size[c] - 1) as f32));
-        if !(a <= b) {
+        // outside the volume, or not a number
+        if a.partial_cmp(&b).is_none_or(|order| order.is_gt()) {
             return;
         }
         (range.low[c], range.high[c]) = (a as usize, b as usize);

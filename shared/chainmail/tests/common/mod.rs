@@ -133,14 +133,14 @@ impl Links {
     pub fn worst(&self, u: &[[f32; 3]]) -> f64 {
         let mut worst = 0.0f64;
         for &(p, q, w) in &self.pairs {
-            for c in 0..3 {
-                let difference = (f64::from(u[p][c]) - f64::from(u[q][c])).abs();
+            for (a, b) in u[p].iter().zip(&u[q]) {
+                let difference = (f64::from(*a) - f64::from(*b)).abs();
                 worst = worst.max(difference - f64::from(w) * 1.001);
             }
         }
         for (v, &bound) in u.iter().zip(&self.bound) {
-            for c in 0..3 {
-                worst = worst.max(f64::from(v[c].abs()) - f64::from(bound) * 1.001);
+            for component in v {
+                worst = worst.max(f64::from(component.abs()) - f64::from(bound) * 1.001);
             }
         }
         worst
