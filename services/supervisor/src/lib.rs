@@ -115,7 +115,7 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
         say!("{:<12} waits for `maille service {} --domain {}`", role.word(), role.word(), simulation.domain());
     }
     let outcome = simulation.watch(&mut signals, options.duration);
-    let report = simulation.end(*outcome.as_ref().unwrap_or(&"failure"));
+    let report = simulation.end(outcome.as_ref().unwrap_or(&"failure"));
     drop(simulation);
     let report = finish(RunReport { scene: names.scene, volume: names.volume, ..report }, options)?;
     outcome.map(|_| report)
