@@ -13,11 +13,13 @@ mod restore;
 mod state;
 mod step;
 
-use maille_contract::{Commit, Role, ToolMove, ViewState, control::Counter};
+use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
+use maille_contract::messages::TOOL_IN_CONTACT;
+use maille_contract::{Commit, ControlBlock, Role, ToolMove, ToolState, ViewState};
 use maille_scene::Scene;
 use maille_store::{CommitOutcome, Reader, Writer};
-use maille_transport::{Domain, Life, Node, monotonic_ns};
-use std::time::Duration;
+use maille_transport::{Domain, Life, Node, Publisher, monotonic_ns};
+use std::{sync::atomic::Ordering::Relaxed, time::Duration};
 use thiserror::Error;
 
 /// Why the deformation process could not start.
@@ -36,6 +38,8 @@ pub enum DeformationError {
 
 /// Sleep between looks at the queue: adds a millisecond on average to a push, costs under one per cent of a core.
 const POLL: Duration = Duration::from_millis(2);
+/// Shortest time between relaxation steps, and how long no push may have come before the first [ns].
+const RELAX_NS: u64 = 33_000_000;
 
 /// Runs until the run ends.
 ///
@@ -54,7 +58,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
     let mut engine = step::Engine::new(&scene, reader.info());
     restore::restore(&mut engine, &writer);
     life.ready();
-    let shortest = Duration::from_secs_f64(1.0 / scene.deformation.rate_hz);
+    let shortest_ns = (1e9 / scene.deformation.rate_hz) as u64;
     let (mut last_step, mut sent, mut refused_view) = (0u64, 0u64, 0u64);
     while life.beat(monotonic_ns()) {
         if let Some((view, generation)) = life.control().view.load::<ViewState>() {
@@ -68,8 +72,17 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             }
         }
         let now = monotonic_ns();
-        let due = now.saturating_sub(last_step) >= shortest.as_nanos() as u64;
+        let due = now.saturating_sub(last_step) >= shortest_ns;
         let Some(message) = due.then(|| moves.latest()).flatten() else {
+            if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && !touched(life.control()) {
+                let dt_s = (now - last_step).min(2 * RELAX_NS) as f64 * 1e-9;
+                last_step = now;
+                if let Some(done) = engine.relax(dt_s, &reader, &mut writer) {
+                    sent += 1;
+                    publish(&mut life, &commits, &done, now, sent, 0);
+                    continue;
+                }
+            }
             std::thread::sleep(POLL);
             continue;
         };
@@ -79,32 +92,37 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             continue;
         };
         last_step = now;
-        let Some(done) = engine.step(&message, &reader, &mut writer) else { continue };
-        let step_ns = monotonic_ns() - now;
-        life.record(now, step_ns, None);
-        let cell = life.cell();
-        cell.count(Counter::MovedElements, done.moved_elements);
-        cell.count(Counter::Failures, done.failures);
-        match done.outcome {
-            CommitOutcome::Published { epoch, .. } => {
-                cell.count(Counter::Commits, 1);
-                sent += 1;
-                let message = Commit {
-                    stamp: life.stamp(sent),
-                    epoch,
-                    cause: message.stamp.sequence,
-                    moved_elements: done.moved_elements,
-                    bricks: done.bricks,
-                    step_ns,
-                    refused_mm: done.refused_mm,
-                };
-                // the epoch itself is in the store; the message is news, and the next one will do
-                let _ = commits.send(&message);
-                cell.count(Counter::Sent, 1);
-            }
-            CommitOutcome::Deferred => cell.count(Counter::Deferred, 1),
-            CommitOutcome::Empty => {}
+        if let Some(done) = engine.step(&message, &reader, &mut writer) {
+            sent += 1;
+            publish(&mut life, &commits, &done, now, sent, message.stamp.sequence);
         }
     }
     Ok(())
+}
+
+/// Whether the tool touches tissue: then nothing relaxes. A haptic process that is gone touches nothing.
+fn touched(control: &ControlBlock) -> bool {
+    let silent = monotonic_ns().saturating_sub(control.service(Role::Haptic).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
+    !silent && control.tool.load::<ToolState>().is_some_and(|(tool, _)| tool.flags & TOOL_IN_CONTACT != 0)
+}
+
+/// Records a step and tells the others.
+fn publish(life: &mut Life, commits: &Publisher<Commit>, done: &step::Done, began_ns: u64, sequence: u64, cause: u64) {
+    let step_ns = monotonic_ns() - began_ns;
+    life.record(began_ns, step_ns, None);
+    let cell = life.cell();
+    cell.count(Counter::MovedElements, done.moved_elements);
+    cell.count(Counter::Failures, done.failures);
+    match done.outcome {
+        CommitOutcome::Published { epoch, .. } => {
+            cell.count(Counter::Commits, 1);
+            let stamp = life.stamp(sequence);
+            let (moved_elements, bricks, refused_mm) = (done.moved_elements, done.bricks, done.refused_mm);
+            // the epoch itself is in the store; the message is news, and the next one will do
+            let _ = commits.send(&Commit { stamp, epoch, cause, moved_elements, bricks, step_ns, refused_mm });
+            cell.count(Counter::Sent, 1);
+        }
+        CommitOutcome::Deferred => cell.count(Counter::Deferred, 1),
+        CommitOutcome::Empty => {}
+    }
 }

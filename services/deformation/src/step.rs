@@ -7,9 +7,11 @@
 //! are those whose tissue now lies at the intersection: its rest position is found by the mapper's inversion.
 
 use crate::state::{State, VERSION};
-use maille_chainmail::{Admission, ChainMail, ChangedRegion, Motion, Pin, Tissue, elements_in_sphere, enclosing_elements, intersection_search};
+use maille_chainmail::{
+    Admission, ChainMail, ChangedRegion, Motion, Pin, Tissue, elements_in_sphere, enclosing_elements, intersection_search,
+};
 use maille_contract::ToolMove;
-use maille_displacement::along_axes;
+use maille_displacement::{along_axes, in_patient};
 use maille_mapper::{BrickSink, MapOptions, remap, rest_position};
 use maille_scene::{Pins, Push, Scene};
 use maille_store::{CommitOutcome, Reader, Transaction, Writer};
@@ -28,7 +30,12 @@ pub(crate) struct Engine {
     pins: Pins,
     push_scale: f64,
     map: MapOptions,
+    /// time constant of relaxation [s], where the scene asks for it
+    relaxation_s: Option<f64>,
 }
+
+/// Displacements below this come to rest [mm].
+const SNAP_MM: f32 = 1e-3;
 
 /// What a step did.
 pub(crate) struct Done {
@@ -65,7 +72,8 @@ impl Engine {
         };
         let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: VOID_HU };
         let state = State { version: VERSION, threshold_hu: d.threshold_hu, last_move: 0, pushes: 0 };
-        Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map }
+        let relaxation_s = scene.has_effect("relaxation").then_some(d.relaxation_s);
+        Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, relaxation_s }
     }
 
     /// Tissue begins at another value from now on.
@@ -91,18 +99,30 @@ impl Engine {
         }
         self.state.last_move = message.stamp.sequence;
         self.state.pushes += 1;
+        let refused_mm = in_patient(grid, pushed.refused_mm.map(f64::from));
+        Some(Done { moved_elements: pushed.moved, refused_mm, ..self.commit(&pushed.region, reader, writer) })
+    }
+
+    /// Whether the scene asks for relaxation.
+    pub fn relaxes(&self) -> bool {
+        self.relaxation_s.is_some()
+    }
+
+    /// Lets tissue creep towards rest for `dt_s`; `None` when it is there.
+    pub fn relax(&mut self, dt_s: f64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let keep = (-dt_s / self.relaxation_s?).exp() as f32;
+        let region = self.mail.relax(keep, SNAP_MM);
+        (!region.is_empty()).then(|| self.commit(&region, reader, writer))
+    }
+
+    /// Maps what changed and commits voxels, displacements and state together.
+    fn commit(&self, region: &ChangedRegion, reader: &Reader, writer: &mut Writer) -> Done {
         let mut transaction = writer.begin();
-        let mapped = remap(&rest, &self.mail, &pushed.region, &mut Sink(&mut transaction), &self.map);
-        self.commit_displacement(&pushed.region, &mut transaction);
+        let mapped = remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
+        self.commit_displacement(region, &mut transaction);
         self.state.write(transaction.state_mut());
-        let refused = maille_displacement::in_patient(grid, pushed.refused_mm.map(f64::from));
-        Some(Done {
-            outcome: transaction.commit(),
-            moved_elements: pushed.moved,
-            bricks: mapped.bricks.len() as u64,
-            failures: mapped.failures,
-            refused_mm: refused,
-        })
+        let bricks = mapped.bricks.len() as u64;
+        Done { outcome: transaction.commit(), moved_elements: 0, bricks, failures: mapped.failures, refused_mm: [0.0; 3] }
     }
 
     /// Where the surface was met and how far it must go [mm, patient], if it must.

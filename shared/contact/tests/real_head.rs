@@ -2,9 +2,9 @@
 
 mod common;
 
+use bytemuck::Zeroable;
 use common::*;
 use maille_contact::{Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, SimulatedHand, Surface, TickInputs};
-use bytemuck::Zeroable;
 use maille_contract::histogram::SharedHistogram;
 use maille_realtime::monotonic_ns;
 use maille_volume::{BrickSource, BrickedVolume, io::read_volume};
@@ -43,7 +43,7 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64,
     let from = center + start * (surface(start) + radius_mm + 4.0);
     let mut hand = SimulatedHand::new(grip, from.into(), (-start).into());
     let (mut worst, mut touched, mut last) = (0.0f64, 0u32, None::<V3>);
-    let ticks = SharedHistogram::zeroed();
+    let compute = SharedHistogram::zeroed();
     let ticks = 2600u64;
     let mut angle = -0.4;
     for n in 0..ticks {
@@ -60,7 +60,7 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64,
         let before = monotonic_ns();
         let out =
             core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&tissue), epoch: 0, tissue_age_s: 0.0, release: false });
-        ticks.record(monotonic_ns() - before);
+        compute.record(monotonic_ns() - before);
         hand.write(out.force_n);
         let f = V3::from(out.force_n);
         assert!(f.norm() <= 3.3 + 1e-9 && f.iter().all(|c| c.is_finite()));
@@ -74,7 +74,7 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64,
     }
     #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
     {
-        println!("threshold {threshold}: tick {:?} ns, worst step {:.2} %", ticks.percentiles(), worst * 100.0);
+        println!("threshold {threshold}: tick {:?} ns, worst step {:.2} %", compute.percentiles(), worst * 100.0);
     }
     (worst, f64::from(touched) / (ticks - 1000) as f64)
 }

@@ -1,6 +1,6 @@
 //! The allocation guard, with the allocator installed.
 
-use maille_realtime::{CountingAllocator, Period, assert_steady, bucket, guard_installed, monotonic_ns, steady};
+use maille_realtime::{CountingAllocator, Period, assert_steady, guard_installed, monotonic_ns, steady};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
@@ -35,13 +35,13 @@ fn other_threads_do_not_count() {
 #[test]
 fn a_periodic_loop_allocates_nothing() {
     let mut period = Period::new(1000.0);
-    let mut counts = [0u32; maille_realtime::BUCKETS];
+    let mut latest = 0;
     assert_steady(|| {
         for _ in 0..20 {
-            counts[bucket(period.wait().lateness_ns)] += 1;
+            latest = period.wait().scheduled_ns;
         }
     });
-    assert_eq!(counts.iter().sum::<u32>(), 20);
+    assert!(latest > 0 && period.ticks() >= 20);
 }
 
 #[test]

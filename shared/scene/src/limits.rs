@@ -37,6 +37,7 @@ pub static LIMITS: &[Limit] = limits! {
     deformation.threshold_hu: -1024 ..= 3071 ["HU"] |s| Some(s.deformation.threshold_hu);
     deformation.bone_hu: -1024 ..= 32767 ["HU"] |s| Some(s.deformation.bone_hu);
     deformation.movement_limit_mm: 0.1 ..= 100 ["mm"] |s| Some(s.deformation.movement_limit_mm);
+    deformation.relaxation_s: 0.05 ..= 600 ["s"] |s| Some(s.deformation.relaxation_s);
     deformation.push_scale: 0 ..= 1 [""] |s| Some(s.deformation.push_scale);
     deformation.inversion_tolerance_mm: 0.0001 ..= 1 ["mm"] |s| Some(s.deformation.inversion_tolerance_mm);
     deformation.rate_hz: 1 ..= 1000 ["Hz"] |s| Some(s.deformation.rate_hz);

@@ -210,7 +210,14 @@ pub static EFFECTS: &[Effect] = &[
         live: true,
         ..Effect::named("sections", "axial, coronal and sagittal sections")
     },
-    Effect::later("relaxation", "tissue creeps back towards rest in idle time", &["deformation"]),
+    Effect {
+        processes: &[Process::Deformation],
+        channels: &[&DISPLACEMENT],
+        stages: &[stage(Process::Deformation, "relaxation", Per::Step)],
+        depends_on: &["deformation"],
+        hard_cases: &["a push in the middle of it", "links of any stiffness", "restart half-way"],
+        ..Effect::named("relaxation", "tissue creeps back towards rest while no tool touches it")
+    },
     Effect::later("object-shape", "separate pieces collide instead of being linked", &["deformation"]),
     Effect::later("cutting", "links are removed by a blade", &["deformation"]),
     Effect::later("palpation", "several proxies feel a finger's area", &["contact"]),

@@ -41,6 +41,8 @@ pub struct Deformation {
     pub bone_hu: f64,
     /// no element moves further than this [mm], 0.1 to 100
     pub movement_limit_mm: f64,
+    /// time constant with which displacements decay under the effect `relaxation` [s], 0.05 to 600
+    pub relaxation_s: f64,
     /// how an inadmissible push is made admissible
     pub push: Push,
     /// which elements a push holds
@@ -64,6 +66,7 @@ impl Default for Deformation {
             threshold_hu: -300.0,
             bone_hu: 300.0,
             movement_limit_mm: 20.0,
+            relaxation_s: 0.6,
             push: Push::Clamp,
             pins: Pins::Enclosing,
             push_scale: 1.0,
