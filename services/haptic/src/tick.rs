@@ -42,7 +42,8 @@ impl<'a> Loop<'a> {
         }
         let rest = reader.rest();
         let sampler = Sampler::new(&rest);
-        let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
+        let way =
+            scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
         Ok(Self {
             reader,
             core: HapticCore::new(config),

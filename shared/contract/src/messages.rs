@@ -189,8 +189,7 @@ fn finite(numbers: &[f64]) -> bool {
 impl ToolMove {
     /// The message, if its numbers can be used.
     pub fn checked(self) -> Option<Self> {
-        let ok =
-            [self.tip_mm, self.outside_mm, self.contact_mm, self.normal].iter().all(|v| finite(v))
+        let ok = [self.tip_mm, self.outside_mm, self.contact_mm, self.normal].iter().all(|v| finite(v))
             && finite(&[self.depth_mm, self.radius_mm])
             && self.radius_mm > 0.0;
         ok.then_some(self)

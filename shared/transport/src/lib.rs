@@ -20,8 +20,8 @@ pub mod segment;
 
 pub use domain::Domain;
 pub use life::Life;
-pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber};
 pub use maille_realtime::monotonic_ns;
+pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber};
 pub use segment::{Access, ControlMap, Segment};
 
 use std::path::PathBuf;
