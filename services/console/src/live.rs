@@ -13,7 +13,6 @@ use maille_contract::{
 };
 use maille_raycast::{Preset, Transfer};
 use maille_scene::{BoxMm, CameraKind, Mode, Scene};
-use maille_store::Reader;
 use maille_transport::{Domain, FrameSubscriber, Life, Node, Publisher, Subscriber, monotonic_ns};
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -62,7 +61,7 @@ struct Live {
 impl Live {
     fn open(domain: &Domain, life: Life, scene: &Scene) -> Result<Self, ConsoleError> {
         let node = Node::open(domain, Role::Console.word())?;
-        let grid = Reader::open(domain, Role::Console).map_err(|e| ConsoleError::Store(e.to_string()))?.info().grid.clone();
+        let grid = maille_store::volume_info(domain).map_err(|e| ConsoleError::Store(e.to_string()))?.grid;
         let box_mm = BoxMm::of(&grid);
         let facts = Facts {
             scene: scene.name.clone(),
@@ -106,9 +105,7 @@ impl Live {
 
 /// The scene's transfer function: a preset, or a file; `None` where neither can be read here (rendering says why).
 fn transfer(name: &str) -> Option<Transfer> {
-    // `soft` and `soft-tissue` are the same
-    let word = |name: &str| name.split('-').next().map(str::to_owned);
-    let preset = Preset::ALL.into_iter().find(|p| word(p.name()) == word(name));
+    let preset = Preset::from_name(name);
     preset.map(Preset::transfer).or_else(|| Transfer::from_text(&std::fs::read_to_string(name).ok()?).ok())
 }
 

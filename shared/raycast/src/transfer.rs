@@ -57,15 +57,15 @@ impl Preset {
         match self {
             Self::Ct => "ct",
             Self::Bone => "bone",
-            Self::SoftTissue => "soft",
+            Self::SoftTissue => "soft-tissue",
             Self::Lung => "lung",
             Self::Skin => "skin",
         }
     }
 
-    /// The preset of a name.
+    /// The preset of a name, or of its first word (`soft`).
     pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|p| p.name() == name)
+        Self::ALL.into_iter().find(|p| p.name() == name || p.name().split('-').next() == Some(name))
     }
 
     /// Its transfer function.

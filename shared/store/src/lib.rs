@@ -34,7 +34,7 @@ mod writer;
 
 pub use keeper::{StoreKeeper, StorePlan};
 pub use layout::{DISPLACEMENT_LEN, STATE_BYTES, StoreSizes};
-pub use reader::{Reader, RestBricks, Snapshot};
+pub use reader::{Reader, RestBricks, Snapshot, volume_info};
 pub use writer::{CommitOutcome, Transaction, Writer};
 
 use thiserror::Error;

@@ -140,6 +140,8 @@ pub(crate) struct Slots<T> {
 impl<T: Pod> Slots<T> {
     pub fn create(domain: &Domain, name: &str, count: usize) -> Result<Self, StoreError> {
         let segment = (count > 0).then(|| Segment::create(domain, name, count * size_of::<T>())).transpose()?;
+        // mapped here too, a page that one service alone reads stays shared memory in the accounts
+        segment.iter().for_each(Segment::prefault);
         Ok(Self { segment, count, marker: PhantomData })
     }
 

@@ -28,6 +28,14 @@ pub struct Reader {
     first_state: usize,
 }
 
+/// Grid and rescale of a domain's volume, without mapping its voxels.
+///
+/// # Errors
+/// When there is no index, or it is of another version.
+pub fn volume_info(domain: &Domain) -> Result<VolumeInfo, StoreError> {
+    IndexMap::open(domain, Access::Read).map(|(_, info, _)| info)
+}
+
 impl Reader {
     /// Maps the store read-only; bricks are prefaulted, so that no tick and no frame waits for a page.
     ///
