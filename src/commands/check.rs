@@ -69,7 +69,7 @@ pub fn run(args: &Args) -> Outcome {
 
 /// The volume, as far as a plan needs it: a made patient is asked point by point and never made.
 enum Patient {
-    Made(Phantom, VolumeInfo, String),
+    Made(Box<Phantom>, VolumeInfo, String),
     Read(Volume, String),
 }
 
@@ -88,7 +88,7 @@ impl Patient {
                 };
                 let phantom = Phantom::new(kind, *seed);
                 let info = VolumeInfo { grid: phantom.grid(*size), rescale: Rescale::IDENTITY };
-                Ok(Self::Made(phantom, info, format!("made {word}, seed {seed}")))
+                Ok(Self::Made(Box::new(phantom), info, format!("made {word}, seed {seed}")))
             }
         }
     }

@@ -69,9 +69,9 @@ pub fn run(args: &Args) -> Outcome {
 fn writer(path: &Path) -> Result<Writer, Failure> {
     let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     match ending.as_deref() {
-        Some("stl") => Ok(|mesh, out| maille_surface::write_stl(mesh, out)),
-        Some("ply") => Ok(|mesh, out| maille_surface::write_ply(mesh, out)),
-        Some("obj") => Ok(|mesh, out| maille_surface::write_obj(mesh, out)),
+        Some("stl") => Ok(maille_surface::write_stl),
+        Some("ply") => Ok(maille_surface::write_ply),
+        Some("obj") => Ok(maille_surface::write_obj),
         _ => Err(Failure::Usage(format!("{} does not end in .stl, .ply or .obj, so its format is not known", path.display()))),
     }
 }
