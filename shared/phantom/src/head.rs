@@ -51,6 +51,11 @@ fn outer(at: &At) -> f64 {
         if p.y > 45.0 {
             return d;
         }
+        // soft tissue over cheekbone, its arch, the jaw's joint and the mastoid
+        d = smooth_min(d, cone(&q, &v(49.0, -51.0, -13.0), 11.0, &v(61.0, -28.0, -13.0), 8.5), 10.0);
+        d = smooth_min(d, cone(&q, &v(61.0, -28.0, -13.0), 8.5, &v(65.0, 14.0, -14.0), 10.5), 10.0);
+        d = smooth_min(d, cone(&q, &v(50.0, -50.0, -10.0), 9.5, &v(50.0, -46.0, 24.0), 8.5), 10.0);
+        d = smooth_min(d, ball(&q, v(55.0, 20.0, -26.0), 19.5), 12.0);
         d = smooth_min(d, ellipsoid(&q, v(0.0, -66.0, -88.0), v(24.0, 20.0, 16.0)), 12.0);
         d = smooth_min(d, ball(&q, v(34.0, -52.0, -44.0), 26.0), 16.0);
         d = smooth_min(d, ellipsoid(&q, v(22.0, -69.0, 25.0), v(24.0, 14.0, 10.0)), 10.0);
