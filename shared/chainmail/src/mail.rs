@@ -117,10 +117,22 @@ impl ChainMail {
         self.elements.slot(id).map(|slot| &self.elements.brick(slot).displacement)
     }
 
-    /// The displacements of a loaded brick, to be changed.
+    /// Smallest and largest displacement [mm] of a brick's elements, by component, with 0 among them.
+    #[inline]
+    pub fn displacement_range(&self, id: BrickId) -> [[f32; 2]; 3] {
+        self.elements.slot(id).map_or([[0.0; 2]; 3], |slot| self.elements.brick(slot).range)
+    }
+
+    /// The displacements of a loaded brick, to be changed; [`Self::measure`] it afterwards.
     pub(crate) fn displacement_planes_mut(&mut self, id: BrickId) -> &mut [[f32; ELEMENTS]; 3] {
         let slot = self.elements.load(id);
         &mut self.elements.brick_mut(slot).displacement.u
+    }
+
+    /// Brings the range of a loaded brick up to date.
+    pub(crate) fn measure(&mut self, id: BrickId) {
+        let slot = self.elements.load(id);
+        self.elements.brick_mut(slot).measure();
     }
 
     /// Bricks that hold displacements (perhaps all zero), ascending.
@@ -133,7 +145,9 @@ impl ChainMail {
     /// Puts back what a commit stored, bit for bit.
     pub fn restore_brick(&mut self, id: BrickId, displacement: &DisplacementBrick) {
         let slot = self.elements.load(id);
-        self.elements.brick_mut(slot).displacement = *displacement;
+        let brick = self.elements.brick_mut(slot);
+        brick.displacement = *displacement;
+        brick.measure();
     }
 
     /// Offset o (infinite in a void) and bound on |u_c| [mm] of an element; the bound holds the links to virtual elements.
@@ -309,7 +323,7 @@ impl ChainMail {
     }
 
     /// What differs from the copies kept before, and how many elements that are.
-    fn changes(&self) -> (ChangedRegion, u64) {
+    fn changes(&mut self) -> (ChangedRegion, u64) {
         let mut touched: Vec<(BrickId, usize)> = self.before.slots().into_iter().map(|s| (self.elements.brick(s).id, s)).collect();
         touched.sort_unstable();
         let (mut region, mut moved) = (ChangedRegion::default(), 0);
@@ -320,6 +334,7 @@ impl ChainMail {
             if count > 0 {
                 region.bricks.push(changed);
                 moved += count;
+                self.elements.brick_mut(slot).measure();
             }
         }
         (region, moved)

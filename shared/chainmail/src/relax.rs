@@ -30,6 +30,7 @@ impl ChainMail {
                 // rest is +0, so that what has come back has the bits of what never moved
                 *u = if left > 0.0 { left.copysign(*u) } else { 0.0 };
             }
+            self.measure(id);
             region.bricks.push(changed);
         }
         region

@@ -26,8 +26,27 @@ pub struct ElementBrick {
     pub id: BrickId,
     /// displacements
     pub displacement: DisplacementBrick,
+    /// smallest and largest displacement of each component, with 0 among them; right between pushes
+    pub range: [[f32; 2]; 3],
     /// limits, once something moved here
     pub limits: Option<Box<LimitsBrick>>,
+}
+
+impl ElementBrick {
+    /// Brings `range` up to date.
+    pub fn measure(&mut self) {
+        for (range, plane) in self.range.iter_mut().zip(&self.displacement.u) {
+            // sixteen lanes, so that it vectorises
+            let (mut low, mut high) = ([0.0f32; 16], [0.0f32; 16]);
+            for part in plane.as_chunks::<16>().0 {
+                for lane in 0..16 {
+                    low[lane] = if part[lane] < low[lane] { part[lane] } else { low[lane] };
+                    high[lane] = if part[lane] > high[lane] { part[lane] } else { high[lane] };
+                }
+            }
+            *range = [low.into_iter().fold(0.0, f32::min), high.into_iter().fold(0.0, f32::max)];
+        }
+    }
 }
 
 /// The loaded bricks, found by number.
@@ -69,7 +88,8 @@ impl Elements {
         if let Some(slot) = self.slot(id) {
             return slot;
         }
-        let mut brick: Box<ElementBrick> = Box::new(ElementBrick { id, displacement: DisplacementBrick::zeroed(), limits: None });
+        let mut brick: Box<ElementBrick> =
+            Box::new(ElementBrick { id, displacement: DisplacementBrick::zeroed(), range: [[0.0; 2]; 3], limits: None });
         brick.id = id;
         self.bricks.push(brick);
         self.slots[id as usize] = (self.bricks.len() - 1) as u32;

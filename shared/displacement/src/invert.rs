@@ -26,10 +26,12 @@ pub enum Scheme {
 pub struct Inverter {
     /// fixed point or Newton
     pub scheme: Scheme,
-    /// error allowed in X [voxels, max norm]
+    /// error allowed in X [voxels along the axis of smallest spacing, max norm]
     pub tolerance: f32,
-    /// bound q on the contraction of u in the max norm; 3o for ChainMail with offset o, held below 1
+    /// bound q on the contraction of u in the max norm of *millimetres*; 3o for ChainMail with offset o, held below 1
     pub contraction: f32,
+    /// spacing of each axis over the smallest: makes that norm of index units
+    pub weight: [f32; 3],
     /// field evaluations allowed a point
     pub max_iterations: u32,
 }
@@ -39,7 +41,7 @@ pub struct Inverter {
 pub struct Inverse {
     /// rest position X [voxels]
     pub position: [f32; 3],
-    /// |x − X − u(X)| in the max norm [voxels]
+    /// |x − X − u(X)| in the weighted max norm [voxels of the smallest spacing]
     pub residual: f32,
     /// field evaluations
     pub iterations: u32,
@@ -51,7 +53,13 @@ impl Inverter {
     /// The usual choice for link limits up to `offset`: fixed point to 0.2, Newton above.
     pub fn for_offset(offset: f32, tolerance: f32) -> Self {
         let scheme = if offset <= 0.2 { Scheme::FixedPoint } else { Scheme::Newton };
-        Self { scheme, tolerance, contraction: (3.0 * offset).clamp(0.0, 0.97), max_iterations: 60 }
+        Self { scheme, tolerance, contraction: (3.0 * offset).clamp(0.01, 0.97), weight: [1.0; 3], max_iterations: 60 }
+    }
+
+    /// The same on a grid of this spacing: limits bound the contraction in millimetres.
+    pub fn on_spacing(self, spacing: [f32; 3]) -> Self {
+        let smallest = spacing.iter().copied().fold(f32::INFINITY, f32::min);
+        Self { weight: spacing.map(|s| s / smallest), ..self }
     }
 
     /// Residual at which a point is done.
@@ -74,7 +82,7 @@ impl Inverter {
         let mut best = Inverse { position: start, residual: f32::INFINITY, iterations: 0, converged: false };
         for iteration in 1..=self.max_iterations {
             let u = field.displacement(x);
-            let r = residual(target, x, u);
+            let r = residual(target, x, u, self.weight);
             best.iterations = iteration;
             if r.1 < best.residual {
                 (best.position, best.residual) = (x, r.1);
@@ -96,7 +104,7 @@ impl Inverter {
         let stop = self.stop();
         let mut x = start;
         let mut here = field.at(x);
-        let mut r = residual(target, x, here.u);
+        let mut r = residual(target, x, here.u, self.weight);
         let mut iterations = 1;
         while r.1 > stop && iterations < self.max_iterations {
             let step = newton_step(&here, r.0);
@@ -105,7 +113,7 @@ impl Inverter {
             let accepted = loop {
                 let tried: [f32; 3] = std::array::from_fn(|c| x[c] + scale * step[c]);
                 let there = field.at(tried);
-                let rt = residual(target, tried, there.u);
+                let rt = residual(target, tried, there.u, self.weight);
                 iterations += 1;
                 if rt.1 < r.1 {
                     (x, here, r) = (tried, there, rt);
@@ -125,16 +133,16 @@ impl Inverter {
 }
 
 #[inline]
-fn residual(target: [f32; 3], x: [f32; 3], u: [f32; 3]) -> ([f32; 3], f32) {
+fn residual(target: [f32; 3], x: [f32; 3], u: [f32; 3], weight: [f32; 3]) -> ([f32; 3], f32) {
     let r: [f32; 3] = std::array::from_fn(|c| target[c] - x[c] - u[c]);
-    let norm = r[0].abs().max(r[1].abs()).max(r[2].abs());
+    let norm = (0..3).map(|c| (r[c] * weight[c]).abs()).fold(0.0, f32::max);
     // f32::max drops a NaN; a NaN anywhere must be seen
     (r, if r.iter().all(|v| v.is_finite()) { norm } else { f32::INFINITY })
 }
 
 /// Solves (1 + J) δ = r by Cramer's rule; where the cell is nearly folded it falls back on δ = r, the fixed point's step.
 #[inline]
-fn newton_step(here: &FieldSample, r: [f32; 3]) -> [f32; 3] {
+pub(crate) fn newton_step(here: &FieldSample, r: [f32; 3]) -> [f32; 3] {
     let mut m = here.jacobian;
     for (c, row) in m.iter_mut().enumerate() {
         row[c] += 1.0;
@@ -169,7 +177,7 @@ mod tests {
     fn both_schemes_find_the_rest_position_within_the_tolerance() {
         for (scheme, q) in [(Scheme::FixedPoint, 0.6), (Scheme::Newton, 0.6), (Scheme::Newton, 0.95)] {
             let field = wave(q);
-            let inverter = Inverter { scheme, tolerance: 1e-3, contraction: q, max_iterations: 60 };
+            let inverter = Inverter { scheme, tolerance: 1e-3, contraction: q, weight: [1.0; 3], max_iterations: 60 };
             for n in 0..200 {
                 let truth = [n as f32 * 0.31 % 9.0, n as f32 * 0.17 % 7.0, n as f32 * 0.05];
                 let u = field(truth).u;
@@ -188,7 +196,7 @@ mod tests {
     fn newton_takes_fewer_steps_near_one_third() {
         let field = wave(0.95);
         let steps = |scheme| {
-            let inverter = Inverter { scheme, tolerance: 1e-3, contraction: 0.95, max_iterations: 400 };
+            let inverter = Inverter { scheme, tolerance: 1e-3, contraction: 0.95, weight: [1.0; 3], max_iterations: 400 };
             (0..100).map(|n| inverter.invert(&field, [n as f32 * 0.37, 1.0, 2.0], [n as f32 * 0.37, 1.0, 2.0]).iterations).sum::<u32>()
         };
         assert!(steps(Scheme::Newton) * 2 < steps(Scheme::FixedPoint));
@@ -198,7 +206,7 @@ mod tests {
     fn folded_and_broken_fields_end_with_a_reported_failure() {
         let folded = |x: [f32; 3]| FieldSample { u: [-2.0 * (x[0] - 5.0), 0.0, 0.0], jacobian: [[-2.0, 0.0, 0.0], [0.0; 3], [0.0; 3]] };
         // det J < 0: the fixed point diverges, and says so
-        let inverter = Inverter { scheme: Scheme::FixedPoint, tolerance: 1e-3, contraction: 0.6, max_iterations: 50 };
+        let inverter = Inverter { scheme: Scheme::FixedPoint, tolerance: 1e-3, contraction: 0.6, weight: [1.0; 3], max_iterations: 50 };
         let found = inverter.invert(&folded, [3.0, 0.0, 0.0], [2.9, 0.0, 0.0]);
         assert!(!found.converged && found.position.iter().all(|v| v.is_finite()));
         let broken = |_: [f32; 3]| FieldSample { u: [f32::NAN; 3], jacobian: [[f32::NAN; 3]; 3] };

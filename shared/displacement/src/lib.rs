@@ -13,10 +13,12 @@
 
 mod axes;
 mod invert;
+mod row;
 mod trilinear;
 
 pub use axes::{along_axes, in_patient};
 pub use invert::{Inverse, Inverter, Scheme};
+pub use row::RowField;
 pub use trilinear::trilinear;
 
 /// Displacement and its derivative at one rest position, in index units.

@@ -11,7 +11,9 @@
 
 #![forbid(unsafe_code)]
 
+mod reach;
 mod rows;
+mod sample;
 mod search;
 mod solve;
 mod window;
@@ -21,26 +23,36 @@ use maille_chainmail::{ChainMail, ChangedRegion};
 use maille_displacement::Inverter;
 use maille_volume::{Brick, BrickId, BrickSource, BrickedVolume, Grid};
 use rayon::prelude::*;
-use rows::{Box3, Spans};
-use std::collections::BTreeMap;
+use rows::{Box3, Cover};
+use solve::{Solver, Values, Workspace};
+use std::sync::{Mutex, PoisonError};
 use window::Window;
 
 /// Where rewritten bricks go.
 pub trait BrickSink {
     /// A private copy of the brick's current version, to be rewritten; the same copy when asked again.
     fn edit(&mut self, id: BrickId) -> &mut Brick;
+
+    /// The brick's current version; a sink that can show it is not asked to edit what stays the same.
+    fn current(&self, _id: BrickId) -> Option<&Brick> {
+        None
+    }
 }
 
 impl BrickSink for BrickedVolume {
     fn edit(&mut self, id: BrickId) -> &mut Brick {
         self.brick_mut(id)
     }
+
+    fn current(&self, id: BrickId) -> Option<&Brick> {
+        Some(self.brick(id))
+    }
 }
 
 /// Choices of the mapper.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {
-    /// error allowed in the pre-image [voxels]
+    /// error allowed in the pre-image [voxels of the smallest spacing]
     pub tolerance: f32,
     /// value of a voxel without pre-image in tissue [HU]
     pub void_hu: f64,
@@ -70,61 +82,128 @@ pub struct MapReport {
     pub failures: u64,
 }
 
-/// Rewrites the voxels whose pre-image the changed elements may have changed. Runs on rayon's current pool.
+impl MapReport {
+    /// Adds what was done elsewhere; bricks are listed at the end.
+    fn add(mut self, other: Self) -> Self {
+        self.voxels += other.voxels;
+        self.iterations += other.iterations;
+        self.searched += other.searched;
+        self.voids += other.voids;
+        self.failures += other.failures;
+        self
+    }
+}
+
+/// Changed bricks, and voxels to be solved, from which on the work is shared among threads: waking them costs some 50 µs.
+const SHARED_CHANGES: usize = 24;
+const SHARED_VOXELS: usize = 24_000;
+
+/// The mapper and its working memory, kept from one push to the next so that a push allocates little.
+#[derive(Default)]
+pub struct Mapper {
+    /// what is to be solved
+    wanted: Cover,
+    /// what each thread found to be solved
+    parts: Vec<Cover>,
+    /// new values, for each brick of `wanted`
+    values: Vec<Values>,
+    /// one a thread, taken and put back
+    workspaces: Mutex<Vec<Workspace>>,
+}
+
+impl Mapper {
+    /// A mapper that holds no memory yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Rewrites the voxels whose pre-image the changed elements may have changed. Runs on rayon's current pool.
+    pub fn remap<S, K>(&mut self, rest: &S, mail: &ChainMail, region: &ChangedRegion, sink: &mut K, options: &MapOptions) -> MapReport
+    where
+        S: BrickSource + ?Sized,
+        K: BrickSink + ?Sized,
+    {
+        let Self { wanted, parts, values, workspaces } = self;
+        let lend = || Lent::take(workspaces);
+
+        // 1. which voxels: each changed brick covers its part
+        wanted.clear(mail.layout());
+        let threads = rayon::current_num_threads();
+        if threads == 1 || region.bricks.len() < SHARED_CHANGES {
+            let mut work = lend();
+            for changed in &region.bricks {
+                wanted.add(mail, changed, &mut work.get().window);
+            }
+        } else {
+            // more parts than threads, so that none waits long for another
+            let share = region.bricks.len().div_ceil(4 * threads);
+            parts.resize_with(parts.len().max(region.bricks.len().div_ceil(share)), Cover::default);
+            parts.par_iter_mut().zip(region.bricks.par_chunks(share)).for_each_init(lend, |work, (part, bricks)| {
+                part.clear(mail.layout());
+                for changed in bricks {
+                    part.add(mail, changed, &mut work.get().window);
+                }
+            });
+            for part in &parts[..region.bricks.len().div_ceil(share)] {
+                wanted.merge(part);
+            }
+        }
+
+        // 2. their values, brick by brick
+        let solver = Solver::new(rest, mail, options);
+        if values.len() < wanted.ids.len() {
+            values.resize(wanted.ids.len(), [0; _]);
+        }
+        let jobs = wanted.ids.iter().zip(&wanted.spans).zip(values.iter_mut());
+        let mut report = if threads == 1 || wanted.voxels() < SHARED_VOXELS {
+            let mut work = lend();
+            jobs.map(|((&id, spans), values)| solver.brick(work.get(), id, spans, values)).fold(MapReport::default(), MapReport::add)
+        } else {
+            wanted
+                .ids
+                .par_iter()
+                .zip(&wanted.spans)
+                .zip(values.par_iter_mut())
+                .map_init(lend, |work, ((&id, spans), values)| solver.brick(work.get(), id, spans, values))
+                .reduce(MapReport::default, MapReport::add)
+        };
+
+        // 3. into every brick that shows them
+        report.bricks = write::write(mail.layout(), wanted, values, sink);
+        report
+    }
+}
+
+/// A workspace on loan.
+struct Lent<'a> {
+    from: &'a Mutex<Vec<Workspace>>,
+    work: Option<Workspace>,
+}
+
+impl<'a> Lent<'a> {
+    fn take(from: &'a Mutex<Vec<Workspace>>) -> Self {
+        let work = from.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        Self { from, work: Some(work.unwrap_or_else(Workspace::new)) }
+    }
+
+    fn get(&mut self) -> &mut Workspace {
+        self.work.get_or_insert_with(Workspace::new)
+    }
+}
+
+impl Drop for Lent<'_> {
+    fn drop(&mut self) {
+        self.from.lock().unwrap_or_else(PoisonError::into_inner).extend(self.work.take());
+    }
+}
+
+/// [`Mapper::remap`] with working memory of its own.
 pub fn remap<S, K>(rest: &S, mail: &ChainMail, region: &ChangedRegion, sink: &mut K, options: &MapOptions) -> MapReport
 where
     S: BrickSource + ?Sized,
     K: BrickSink + ?Sized,
 {
-    // 1. which voxels: each changed brick covers its part, merged in order of bricks
-    let parts: Vec<BTreeMap<BrickId, Box<Spans>>> = region
-        .bricks
-        .par_iter()
-        .map_init(Window::new, |window, changed| {
-            let mut out = BTreeMap::new();
-            rows::cover(mail, changed, window, &mut out);
-            out
-        })
-        .collect();
-    let mut wanted: BTreeMap<BrickId, Box<Spans>> = BTreeMap::new();
-    for part in parts {
-        for (id, spans) in part {
-            let Some(merged) = wanted.get_mut(&id) else {
-                wanted.insert(id, spans);
-                continue;
-            };
-            for (to, from) in merged.iter_mut().zip(spans.iter()) {
-                if from[1] > 0 {
-                    *to = if to[1] == 0 { *from } else { [to[0].min(from[0]), to[1].max(from[1])] };
-                }
-            }
-        }
-    }
-
-    // 2. their values, brick by brick in parallel
-    let inverter = inverter(mail, options);
-    let wanted: Vec<(BrickId, Box<Spans>)> = wanted.into_iter().collect();
-    let solved: Vec<solve::Solved> = wanted
-        .par_iter()
-        .map_init(Window::new, |window, (id, spans)| solve::brick(rest, mail, &inverter, options, window, *id, spans))
-        .collect();
-
-    // 3. into every brick that shows them
-    let mut report = MapReport::default();
-    for s in &solved {
-        report.voxels += s.report.voxels;
-        report.iterations += s.report.iterations;
-        report.searched += s.report.searched;
-        report.voids += s.report.voids;
-        report.failures += s.report.failures;
-    }
-    report.bricks = write::write(mail.layout(), &wanted, &solved, sink);
-    report
-}
-
-/// The scheme that suits the mail's offset.
-fn inverter(mail: &ChainMail, options: &MapOptions) -> Inverter {
-    Inverter::for_offset(mail.tissue().offset, options.tolerance)
+    Mapper::new().remap(rest, mail, region, sink, options)
 }
 
 /// Rest position [mm, LPS] of the tissue that is now at `world_mm`; `None` outside the grid or where no inverse was found.
@@ -135,12 +214,12 @@ pub fn rest_position(mail: &ChainMail, grid: &Grid, world_mm: [f64; 3]) -> Optio
     }
     let low = index.map(|v| v as usize);
     let range = Box3 { low, high: std::array::from_fn(|c| (low[c] + 1).min(grid.size[c] - 1)) };
-    let range = solve::preimage_box(mail, range);
     let mut window = Window::new();
-    window.gather(mail, range);
-    // relative to the voxel below, so that f32 loses nothing far from the grid's first voxel
-    let target = index.map(|v| v as f32);
-    let found = inverter(mail, &MapOptions { tolerance: 1e-3, ..MapOptions::default() }).invert(&window, target, target);
+    window.gather(mail, reach::preimage_box(mail, range));
+    // relative to the window, so that f32 loses nothing far from the grid's first voxel
+    let target = std::array::from_fn(|c| (index[c] - window.low()[c] as f64) as f32);
+    let inverter = Inverter::for_offset(mail.tissue().offset, 1e-3).on_spacing(mail.spacing());
+    let found = inverter.invert(&window, target, target);
     let position: [f64; 3] = std::array::from_fn(|c| index[c] + f64::from(found.position[c] - target[c]));
     (found.converged && grid.contains_index(position)).then(|| grid.world_from_index(position))
 }

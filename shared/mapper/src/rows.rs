@@ -1,13 +1,13 @@
 //! Which voxels have to be solved: the image of every cell that touches a changed element.
 //!
 //! A cell whose corners kept their displacement maps as before, and the map is one-to-one; so the voxels whose pre-image
-//! changed lie in the images of the touched cells. Each image is covered by the box of its eight displaced corners, rows
-//! of cells by the box of the row's. Covering too much costs time, never correctness.
+//! changed lie in the images of the touched cells. Images of runs of cells are covered by the box of their displaced
+//! corners. Covering too much costs time, never correctness; the union is the same whoever collects it in whatever order.
 
 use crate::window::Window;
 use maille_chainmail::{ChainMail, ChangedBrick};
 use maille_volume::{BrickId, BrickLayout, brick::EDGE};
-use std::collections::BTreeMap;
+use wide::f32x4;
 
 /// Inclusive box of voxels.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,88 +23,173 @@ pub const ROWS: usize = EDGE * EDGE;
 pub type Spans = [[u8; 2]; ROWS];
 
 /// Cells covered at a time along a row: shorter runs cover less, longer ones cost less.
-const RUN: usize = 4;
+const RUN: isize = 6;
+/// Corners along i that the cells of a brick's row and of its neighbours have.
+const CORNERS: usize = EDGE + 2;
+/// f32 holds indices inside a brick to 1e-3 voxel and better; the slack covers that.
+const SLACK: f32 = 1e-3;
+/// Beyond every displacement of a volume of less than 2³² voxels [voxels]: makes truncation a floor.
+const BIAS: f32 = 2048.0;
 
-/// Adds to `out`, brick by brick, the voxels that the changed elements of one brick may have given a new pre-image.
-pub fn cover(mail: &ChainMail, changed: &ChangedBrick, window: &mut Window, out: &mut BTreeMap<BrickId, Box<Spans>>) {
-    let layout = mail.layout();
-    let (first, size) = (layout.first_voxel(changed.id), layout.size);
-    let range = Box3 { low: first.map(|v| v.saturating_sub(1)), high: std::array::from_fn(|c| (first[c] + EDGE).min(size[c] - 1)) };
-    window.gather(mail, range);
-    // cells along j and k: cell c has corners c and c + 1, so that a span touches the cells from one below it
-    let span = |j: isize, k: isize| -> [u8; 2] {
-        let inside = (0..EDGE as isize).contains(&j) && (0..EDGE as isize).contains(&k);
-        if inside { changed.spans[(k * EDGE as isize + j) as usize] } else { [0, 0] }
-    };
-    for k in -1..EDGE as isize {
-        for j in -1..EDGE as isize {
-            // the union of the four rows of corners
-            let mut cells: Option<[isize; 2]> = None;
-            for (dj, dk) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-                let s = span(j + dj, k + dk);
-                if s[1] > 0 {
-                    let c = cells.get_or_insert([isize::MAX, 0]);
-                    *c = [c[0].min(s[0] as isize - 1), c[1].max(s[1] as isize)];
+/// No entry.
+const NONE: u32 = u32::MAX;
+
+/// Voxels to be solved, brick by brick; its memory is kept from one use to the next.
+#[derive(Default)]
+pub struct Cover {
+    /// for each brick of the volume its place in `ids`
+    place: Vec<u32>,
+    /// bricks with voxels to be solved, in order of discovery
+    pub ids: Vec<BrickId>,
+    /// their rows
+    pub spans: Vec<Spans>,
+}
+
+impl Cover {
+    /// Empty, for a volume of this layout.
+    pub fn clear(&mut self, layout: &BrickLayout) {
+        for &id in &self.ids {
+            self.place[id as usize] = NONE;
+        }
+        self.place.resize(layout.count(), NONE);
+        self.ids.clear();
+        self.spans.clear();
+    }
+
+    /// Place of a brick, if it has voxels to be solved.
+    #[inline]
+    pub fn place(&self, id: BrickId) -> Option<usize> {
+        let place = self.place[id as usize];
+        (place != NONE).then_some(place as usize)
+    }
+
+    #[inline]
+    fn place_mut(&mut self, id: BrickId) -> usize {
+        if self.place[id as usize] == NONE {
+            self.place[id as usize] = self.ids.len() as u32;
+            self.ids.push(id);
+            self.spans.push([[0; 2]; ROWS]);
+        }
+        self.place[id as usize] as usize
+    }
+
+    /// Number of voxels to be solved.
+    pub fn voxels(&self) -> usize {
+        self.spans.iter().flatten().map(|s| usize::from(s[1] - s[0])).sum()
+    }
+
+    /// Adds what another cover holds.
+    pub fn merge(&mut self, other: &Self) {
+        for (id, spans) in other.ids.iter().zip(&other.spans) {
+            let place = self.place_mut(*id);
+            for (to, from) in self.spans[place].iter_mut().zip(spans).filter(|(_, from)| from[1] > 0) {
+                extend(to, *from);
+            }
+        }
+    }
+
+    /// Adds the voxels that the changed elements of one brick may have given a new pre-image.
+    pub fn add(&mut self, mail: &ChainMail, changed: &ChangedBrick, window: &mut Window) {
+        let layout = *mail.layout();
+        let Some((low, high)) = bounds(&changed.spans) else { return };
+        let (first, last) = (layout.first_voxel(changed.id), layout.size.map(|s| s - 1));
+        // elements low − 1 … high + 1 are corners of the touched cells low − 1 … high
+        window.gather(
+            mail,
+            Box3 {
+                low: std::array::from_fn(|c| (first[c] + low[c]).saturating_sub(1)),
+                high: std::array::from_fn(|c| (first[c] + high[c] + 1).min(last[c])),
+            },
+        );
+        let span = |j: isize, k: isize| -> [u8; 2] {
+            let inside = (0..EDGE as isize).contains(&j) && (0..EDGE as isize).contains(&k);
+            if inside { changed.spans[(k * EDGE as isize + j) as usize] } else { [0, 0] }
+        };
+        let mut boxes = [[f32x4::ZERO; 2]; CORNERS];
+        for k in low[2] as isize - 1..=high[2] as isize {
+            for j in low[1] as isize - 1..=high[1] as isize {
+                // the union of the four rows of corners
+                let mut cells: Option<[isize; 2]> = None;
+                for (dj, dk) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                    let s = span(j + dj, k + dk);
+                    if s[1] > 0 {
+                        let c = cells.get_or_insert([isize::MAX, 0]);
+                        *c = [c[0].min(s[0] as isize - 1), c[1].max(s[1] as isize)];
+                    }
+                }
+                let Some([from, to]) = cells else { continue };
+                corner_boxes(window, first, [from, j, k], to, &mut boxes);
+                let mut i = from;
+                while i < to {
+                    let end = (i + RUN).min(to);
+                    let corners = &boxes[(i + 1) as usize..=(end + 1) as usize];
+                    let range = corners.iter().fold(corners[0], |r, b| [r[0].fast_min(b[0]), r[1].fast_max(b[1])]);
+                    self.add_box(&layout, first, range);
+                    i = end;
                 }
             }
-            let Some([from, to]) = cells else { continue };
-            let mut i = from;
-            while i < to {
-                let end = (i + RUN as isize).min(to);
-                cover_run(layout, window, first, [i, j, k], end, out);
-                i = end;
+        }
+    }
+
+    /// Adds the voxels in a box of positions, relative to the voxel `first`.
+    #[inline]
+    fn add_box(&mut self, layout: &BrickLayout, first: [usize; 3], [low, high]: [f32x4; 2]) {
+        let floor = |v: f32x4| (v.fast_max(f32x4::splat(1.0 - BIAS)).fast_min(f32x4::splat(BIAS)) + f32x4::splat(BIAS)).fast_trunc_int();
+        // ceil(v) = −floor(−v)
+        let a = floor(f32x4::splat(SLACK) - low).to_array().map(|v| BIAS as isize - v as isize);
+        let b = floor(high + f32x4::splat(SLACK)).to_array().map(|v| v as isize - BIAS as isize);
+        let at = |c: usize, v: isize| first[c] as isize + v;
+        let (mut from, mut to) = ([0; 3], [0; 3]);
+        for c in 0..3 {
+            let (low, high) = (at(c, a[c]).max(0), at(c, b[c]).min(layout.size[c] as isize - 1));
+            if low > high {
+                return;
+            }
+            (from[c], to[c]) = (low as usize, high as usize);
+        }
+        for brick in from[0] / EDGE..=to[0] / EDGE {
+            let i = [(from[0].max(brick * EDGE) - brick * EDGE) as u8, (to[0].min(brick * EDGE + EDGE - 1) - brick * EDGE + 1) as u8];
+            for k in from[2]..=to[2] {
+                for j in from[1]..=to[1] {
+                    let place = self.place_mut(layout.id([brick, j / EDGE, k / EDGE]));
+                    extend(&mut self.spans[place][k % EDGE * EDGE + j % EDGE], i);
+                }
             }
         }
     }
 }
 
-/// Covers the image of the cells i..end of a row.
-fn cover_run(
-    layout: &BrickLayout,
-    window: &Window,
-    first: [usize; 3],
-    [i, j, k]: [isize; 3],
-    end: isize,
-    out: &mut BTreeMap<BrickId, Box<Spans>>,
-) {
-    let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
-    for dk in 0..2 {
-        for dj in 0..2 {
-            for x in i..=end {
-                let at = [first[0] as isize + x, first[1] as isize + j + dj, first[2] as isize + k + dk];
-                let u = window.element(at);
-                for c in 0..3 {
-                    let v = at[c] as f32 + u[c];
-                    low[c] = low[c].min(v);
-                    high[c] = high[c].max(v);
-                }
-            }
-        }
+/// Box around the displaced corners (i, j … j + 1, k … k + 1) for each i of `from[0]..=to`, relative to the voxel `first`; that of
+/// corner i is written to place i + 1.
+#[inline]
+fn corner_boxes(window: &Window, first: [usize; 3], [from, j, k]: [isize; 3], to: isize, out: &mut [[f32x4; 2]; CORNERS]) {
+    let (low, size) = (window.low(), window.size());
+    let local = |c: usize, v: isize| (first[c] as isize + v - low[c] as isize).clamp(0, size[c] as isize - 1) as usize;
+    let rows = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dj, dk)| (window.row(local(1, j + dj), local(2, k + dk)), dj, dk));
+    for i in from..=to {
+        let x = local(0, i);
+        let at =
+            |(row, dj, dk): (&[[f32; 4]], isize, isize)| f32x4::new(row[x]) + f32x4::new([i as f32, (j + dj) as f32, (k + dk) as f32, 0.0]);
+        let [a, b, c, d] = rows.map(at);
+        out[(i + 1) as usize] = [a.fast_min(b).fast_min(c.fast_min(d)), a.fast_max(b).fast_max(c.fast_max(d))];
     }
-    // f32 holds indices to 1e-3 voxel and better; the slack covers that
-    let slack = 1e-3;
-    let mut range = Box3 { low: [0; 3], high: [0; 3] };
-    for c in 0..3 {
-        let (a, b) = ((low[c] - slack).ceil().max(0.0), (high[c] + slack).floor().min((layout.size[c] - 1) as f32));
-        // outside the volume, or not a number
-        if a.partial_cmp(&b).is_none_or(|order| order.is_gt()) {
-            return;
+}
+
+#[inline]
+fn extend(span: &mut [u8; 2], [low, high]: [u8; 2]) {
+    *span = if span[1] == 0 { [low, high] } else { [span[0].min(low), span[1].max(high)] };
+}
+
+/// Box around the spans of a brick (inclusive); `None`: they are empty.
+pub fn bounds(spans: &Spans) -> Option<([usize; 3], [usize; 3])> {
+    let (mut low, mut high, mut any) = ([EDGE; 3], [0; 3], false);
+    for row in (0..ROWS).filter(|&r| spans[r][1] > 0) {
+        let (a, b) = ([spans[row][0] as usize, row % EDGE, row / EDGE], [spans[row][1] as usize - 1, row % EDGE, row / EDGE]);
+        for c in 0..3 {
+            low[c] = low[c].min(a[c]);
+            high[c] = high[c].max(b[c]);
         }
-        (range.low[c], range.high[c]) = (a as usize, b as usize);
+        any = true;
     }
-    for k in range.low[2]..=range.high[2] {
-        for j in range.low[1]..=range.high[1] {
-            let mut i = range.low[0];
-            while i <= range.high[0] {
-                let brick = i / EDGE;
-                let stop = (range.high[0] + 1).min((brick + 1) * EDGE);
-                let id = layout.id([brick, j / EDGE, k / EDGE]);
-                let spans = out.entry(id).or_insert_with(|| Box::new([[0; 2]; ROWS]));
-                let span = &mut spans[k % EDGE * EDGE + j % EDGE];
-                let (a, b) = ((i - brick * EDGE) as u8, (stop - brick * EDGE) as u8);
-                *span = if span[1] == 0 { [a, b] } else { [span[0].min(a), span[1].max(b)] };
-                i = stop;
-            }
-        }
-    }
+    any.then_some((low, high))
 }

@@ -11,8 +11,9 @@ const REACH: isize = 3;
 /// Newton steps in a cell: its map is trilinear, a few settle it.
 const STEPS: usize = 8;
 
-/// A rest position near `around`, in a cell that `accept` takes, that maps to `target` up to `stop` [voxels].
-pub fn cell(window: &Window, target: [f32; 3], around: [f32; 3], stop: f32, accept: impl Fn([f32; 3]) -> bool) -> Option<Inverse> {
+/// A rest position near `around`, in a cell that `accept` takes, that maps to `target` up to `stop` [voxels]; positions are
+/// relative to the window.
+pub fn cell(window: &Window, target: [f32; 3], around: [f32; 3], stop: f32, accept: &mut dyn FnMut([f32; 3]) -> bool) -> Option<Inverse> {
     if !around.iter().all(|v| v.is_finite()) {
         return None;
     }
@@ -28,7 +29,7 @@ pub fn cell(window: &Window, target: [f32; 3], around: [f32; 3], stop: f32, acce
                 let Some(found) = inside(&corners, base, target, stop) else { continue };
                 // of several (a fold), the one nearest to where the kernel was: continuous from voxel to voxel
                 let distance = |p: [f32; 3]| (0..3).map(|c| (p[c] - around[c]).powi(2)).sum::<f32>();
-                if accept(found.position) && best.is_none_or(|b| distance(found.position) < distance(b.position)) {
+                if best.is_none_or(|b| distance(found.position) < distance(b.position)) && accept(found.position) {
                     best = Some(found);
                 }
             }

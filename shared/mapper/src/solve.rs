@@ -1,169 +1,165 @@
-//! The voxels of one brick: pre-image by the inversion kernel, started from the voxel before, then a trilinear rest value.
+//! The voxels of one brick: pre-images row by row with the inversion kernel, then trilinear rest values.
+//!
+//! A row starts from the rows solved before it: the displacement of voxel (i, j, k) is guessed as d(j−1, k) + d(j, k−1) −
+//! d(j−1, k−1), which is exact wherever d is a sum of a function of j and one of k, as dents of cubic regions are.
 
 use crate::{
     MapOptions, MapReport,
-    rows::{Box3, Spans},
+    reach::preimage_box,
+    rows::{Box3, ROWS, Spans, bounds},
+    sample::RestSampler,
     search,
     window::Window,
 };
 use maille_chainmail::{ChainMail, DisplacementBrick};
-use maille_displacement::{DisplacementField, Inverter};
-use maille_volume::{Brick, BrickId, BrickSource, brick::EDGE};
+use maille_displacement::{DisplacementField, Inverter, Scheme};
+use maille_volume::{BrickId, BrickSource, brick::EDGE};
+use wide::f32x4;
 
-/// New values of the wanted voxels of one brick.
-pub struct Solved {
-    /// stored values, EDGE³; only the wanted spans mean something
-    pub values: Box<[i16; EDGE * EDGE * EDGE]>,
-    pub report: MapReport,
+/// Stored values of a brick's voxels; only those in the wanted spans mean something.
+pub type Values = [i16; EDGE * EDGE * EDGE];
+
+/// Working memory of one thread.
+pub struct Workspace {
+    pub window: Window,
+    /// x − X of the rows solved [voxels]
+    found: Box<[[f32x4; EDGE]; ROWS]>,
 }
 
-/// Box of elements that holds the pre-images of a box of voxels: grown by the displacements found inside, until it holds them.
-pub fn preimage_box(mail: &ChainMail, voxels: Box3) -> Box3 {
-    let (layout, spacing) = (mail.layout(), mail.spacing());
-    let mut reach = [[0.0f32; 2]; 3];
-    loop {
-        let range = grow(layout.size, voxels, &reach);
-        let mut found = reach;
-        let bricks = |c: usize| range.low[c] / EDGE..=range.high[c] / EDGE;
-        for bk in bricks(2) {
-            for bj in bricks(1) {
-                for bi in bricks(0) {
-                    let Some(brick) = mail.displacement_brick(layout.id([bi, bj, bk])) else { continue };
-                    for c in 0..3 {
-                        let (low, high) = brick.u[c].iter().fold((0.0f32, 0.0f32), |(l, h), &u| (l.min(u), h.max(u)));
-                        found[c] = [found[c][0].min(low / spacing[c]), found[c][1].max(high / spacing[c])];
-                    }
+impl Workspace {
+    pub fn new() -> Self {
+        Self { window: Window::new(), found: Box::new([[f32x4::ZERO; EDGE]; ROWS]) }
+    }
+}
+
+/// What stays the same for all bricks of one mapping.
+pub struct Solver<'a, S: BrickSource + ?Sized> {
+    pub rest: &'a S,
+    pub mail: &'a ChainMail,
+    pub inverter: Inverter,
+    /// stored value of what is void
+    void: i16,
+}
+
+impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
+    pub fn new(rest: &'a S, mail: &'a ChainMail, options: &MapOptions) -> Self {
+        let void = rest.info().rescale.stored(options.void_hu).round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16;
+        let inverter = Inverter::for_offset(mail.tissue().offset, options.tolerance).on_spacing(mail.spacing());
+        Self { rest, mail, inverter, void }
+    }
+
+    /// Solves the wanted voxels of a brick.
+    pub fn brick(&self, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
+        let mut report = MapReport::default();
+        let Some((low, high)) = bounds(spans) else { return report };
+        let first = self.mail.layout().first_voxel(id);
+        let voxels = Box3 { low: std::array::from_fn(|c| first[c] + low[c]), high: std::array::from_fn(|c| first[c] + high[c]) };
+        work.window.gather(self.mail, preimage_box(self.mail, voxels));
+        let origin = work.window.low();
+        let mut sampler = RestSampler::new(self.rest, origin, work.window.size());
+        for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
+            let range = span[0] as usize..span[1] as usize;
+            report.voxels += range.len() as u64;
+            let out: &mut [i16; EDGE] = values.as_chunks_mut().0[row..].first_mut().expect("the row is one of the brick's");
+            if work.window.at_rest() {
+                for i in range {
+                    out[i] = self.rest.voxel(first[0] + i, first[1] + row % EDGE, first[2] + row / EDGE);
                 }
-            }
-        }
-        if found == reach {
-            return range;
-        }
-        reach = found;
-    }
-}
-
-/// X = x − u, one more element on each side for the cell's corners.
-fn grow(size: [usize; 3], voxels: Box3, reach: &[[f32; 2]; 3]) -> Box3 {
-    let last = |c: usize| size[c] - 1;
-    Box3 {
-        low: std::array::from_fn(|c| voxels.low[c].saturating_sub(reach[c][1].ceil() as usize + 1)),
-        high: std::array::from_fn(|c| (voxels.high[c] + (-reach[c][0]).ceil() as usize + 1).min(last(c))),
-    }
-}
-
-/// Solves the wanted voxels of a brick.
-pub fn brick<S: BrickSource + ?Sized>(
-    rest: &S,
-    mail: &ChainMail,
-    inverter: &Inverter,
-    options: &MapOptions,
-    window: &mut Window,
-    id: BrickId,
-    spans: &Spans,
-) -> Solved {
-    let layout = mail.layout();
-    let first = layout.first_voxel(id);
-    let mut out = Solved { values: Box::new([0; EDGE * EDGE * EDGE]), report: MapReport::default() };
-    let voxels = Box3 { low: first, high: std::array::from_fn(|c| (first[c] + EDGE).min(layout.size[c]) - 1) };
-    window.gather(mail, preimage_box(mail, voxels));
-    let at_rest = window.at_rest();
-    let threshold = mail.tissue().threshold_hu;
-    let sampler = RestSampler { rest, size: layout.size };
-    let rescale = rest.info().rescale;
-    let void = rescale.stored(options.void_hu).round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16;
-    for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
-        let (j, k) = (first[1] + row % EDGE, first[2] + row / EDGE);
-        // the displacement of the voxel before is the next one's first guess
-        let mut warm: Option<[f32; 3]> = None;
-        for i in span[0] as usize..span[1] as usize {
-            let voxel = [first[0] + i, j, k];
-            let n = DisplacementBrick::offset(i, row % EDGE, row / EDGE);
-            out.report.voxels += 1;
-            if at_rest {
-                out.values[n] = rest.voxel(voxel[0], voxel[1], voxel[2]);
                 continue;
             }
-            let target = voxel.map(|v| v as f32);
-            let u = warm.unwrap_or_else(|| window.displacement(target));
-            let mut found = inverter.invert(window, target, std::array::from_fn(|c| target[c] - u[c]));
-            out.report.iterations += u64::from(found.iterations);
-            let astray = !found.converged || threshold.is_some_and(|t| !sampler.is_tissue_cell(found.position, t, rescale));
-            if astray {
-                // void or fold: look for a tissue cell whose image holds the voxel
-                out.report.searched += 1;
-                let tissue = |position: [f32; 3]| threshold.is_none_or(|t| sampler.is_tissue_cell(position, t, rescale));
-                match search::cell(window, target, found.position, inverter.stop(), tissue) {
-                    Some(better) => found = better,
-                    // a void that nothing entered keeps its value, one that tissue left is void
-                    None if threshold.is_some() => {
-                        let still = window.displacement(target) == [0.0; 3];
-                        out.values[n] = if still { rest.voxel(voxel[0], voxel[1], voxel[2]) } else { void };
-                        out.report.voids += u64::from(!still);
-                        continue;
-                    }
-                    None if !found.converged => out.report.failures += 1,
-                    None => {}
-                }
+            // 1. pre-images, in positions relative to the window's first element
+            let local = |c: usize, v: usize| (first[c] + v) as f32 - origin[c] as f32;
+            let (y, z) = (local(1, row % EDGE), local(2, row / EDGE));
+            let target: [f32x4; EDGE] = std::array::from_fn(|i| f32x4::new([local(0, i), y, z, 0.0]));
+            let mut position = target;
+            guess(spans, &work.found, row, range.clone(), &mut position);
+            let mut converged = [false; EDGE];
+            report.iterations += u64::from(self.inverter.invert_row(&work.window, &target, range.clone(), &mut position, &mut converged));
+            for i in range.clone() {
+                work.found[row][i] = target[i] - position[i];
             }
-            warm = Some(std::array::from_fn(|c| target[c] - found.position[c]));
-            out.values[n] = match sampler.stored(found.position) {
-                Some(value) => value,
-                None => {
-                    out.report.voids += 1;
-                    void
-                }
-            };
+            // 2. values; the few that did not converge, and all beside voids, one by one
+            let all = converged[range.clone()].iter().all(|&c| c) && self.mail.tissue().threshold_hu.is_none();
+            for i in range {
+                let x = xyz(position[i]);
+                let value = if all {
+                    sampler.stored(x)
+                } else {
+                    let voxel = [first[0] + i, first[1] + row % EDGE, first[2] + row / EDGE];
+                    let hard = Hard { solver: self, window: &work.window, voxel, target: xyz(target[i]) };
+                    hard.value(&mut sampler, x, converged[i], &mut report)
+                };
+                report.voids += u64::from(value.is_none());
+                out[i] = value.unwrap_or(self.void);
+            }
+        }
+        report
+    }
+}
+
+/// Moves the starts of a row to where the rows before it say.
+#[inline]
+fn guess(spans: &Spans, found: &[[f32x4; EDGE]; ROWS], row: usize, range: std::ops::Range<usize>, position: &mut [f32x4; EDGE]) {
+    let (j, k) = (row % EDGE, row / EDGE);
+    let none = [0u8, 0];
+    let (below, before) = (if j > 0 { spans[row - 1] } else { none }, if k > 0 { spans[row - EDGE] } else { none });
+    let corner = if j > 0 && k > 0 { spans[row - EDGE - 1] } else { none };
+    let has = |s: [u8; 2], i: usize| (s[0] as usize..s[1] as usize).contains(&i);
+    for i in range {
+        let start = &mut position[i];
+        match (has(below, i), has(before, i)) {
+            (true, true) if has(corner, i) => *start -= found[row - 1][i] + found[row - EDGE][i] - found[row - EDGE - 1][i],
+            (true, _) => *start -= found[row - 1][i],
+            (_, true) => *start -= found[row - EDGE][i],
+            _ => {}
         }
     }
-    out
 }
 
-/// Trilinear rest values in stored units at continuous indices.
-struct RestSampler<'a, S: BrickSource + ?Sized> {
-    rest: &'a S,
-    size: [usize; 3],
+#[inline(always)]
+fn xyz(v: f32x4) -> [f32; 3] {
+    let [x, y, z, _] = v.to_array();
+    [x, y, z]
 }
 
-impl<'a, S: BrickSource + ?Sized> RestSampler<'a, S> {
-    /// Brick, offset of the cell's lower corner and fractions; `None` outside the grid (a hundredth of a voxel is rounding).
-    #[inline]
-    fn locate(&self, position: [f32; 3]) -> Option<(&'a Brick, usize, [f32; 3])> {
-        let (mut base, mut f) = ([0usize; 3], [0.0f32; 3]);
-        for c in 0..3 {
-            let last = (self.size[c] - 1) as f32;
-            if !(position[c] >= -0.01 && position[c] <= last + 0.01) {
-                return None;
-            }
-            let p = position[c].clamp(0.0, last);
-            base[c] = (p as usize).min(self.size[c].saturating_sub(2));
-            f[c] = p - base[c] as f32;
+/// A voxel that the row's kernel did not settle, or that may lie beside a void.
+struct Hard<'a, 's, S: BrickSource + ?Sized> {
+    solver: &'a Solver<'s, S>,
+    window: &'a Window,
+    voxel: [usize; 3],
+    target: [f32; 3],
+}
+
+impl<S: BrickSource + ?Sized> Hard<'_, '_, S> {
+    /// Its value; `None`: void.
+    fn value(&self, sampler: &mut RestSampler<S>, mut position: [f32; 3], mut converged: bool, report: &mut MapReport) -> Option<i16> {
+        let threshold = self.solver.mail.tissue().threshold_hu;
+        if !converged {
+            // damped Newton from the voxel's own displacement
+            let inverter = Inverter { scheme: Scheme::Newton, ..self.solver.inverter };
+            let u = self.window.displacement(self.target);
+            let found = inverter.invert(self.window, self.target, std::array::from_fn(|c| self.target[c] - u[c]));
+            report.iterations += u64::from(found.iterations);
+            (position, converged) = (found.position, found.converged);
         }
-        let brick = self.rest.brick(self.rest.layout().brick_of(base[0], base[1], base[2]));
-        Some((brick, Brick::offset((base[0] % EDGE) as isize, (base[1] % EDGE) as isize, (base[2] % EDGE) as isize), f))
-    }
-
-    #[inline]
-    fn corners(brick: &Brick, at: usize) -> [f32; 8] {
-        use maille_volume::brick::{ROW, SLICE};
-        std::array::from_fn(|n| f32::from(brick.voxels[at + (n & 1) + (n >> 1 & 1) * ROW + (n >> 2) * SLICE]))
-    }
-
-    #[inline]
-    fn stored(&self, position: [f32; 3]) -> Option<i16> {
-        let (brick, at, f) = self.locate(position)?;
-        let v = Self::corners(brick, at);
-        let lerp = |a: f32, b: f32, t: f32| a + (b - a) * t;
-        let (a, b) = (lerp(v[0], v[1], f[0]), lerp(v[2], v[3], f[0]));
-        let (c, d) = (lerp(v[4], v[5], f[0]), lerp(v[6], v[7], f[0]));
-        let value = lerp(lerp(a, b, f[1]), lerp(c, d, f[1]), f[2]);
-        // a trilinear value lies between its corners, so that it fits an i16
-        Some((value + 0.5).floor() as i16)
-    }
-
-    /// Whether the cell around a rest position holds any tissue at its corners.
-    fn is_tissue_cell(&self, position: [f32; 3], threshold: f64, rescale: maille_volume::Rescale) -> bool {
-        self.locate(position)
-            .is_some_and(|(brick, at, _)| Self::corners(brick, at).iter().any(|&v| rescale.value(f64::from(v)) >= threshold))
+        if !converged || threshold.is_some_and(|t| !sampler.is_tissue_cell(position, t)) {
+            // void or fold: look for a tissue cell whose image holds the voxel
+            report.searched += 1;
+            let mut tissue = |p: [f32; 3]| threshold.is_none_or(|t| sampler.is_tissue_cell(p, t));
+            match search::cell(self.window, self.target, position, self.solver.inverter.stop(), &mut tissue) {
+                Some(better) => position = better.position,
+                // a void that nothing entered keeps its value, one that tissue left is void
+                None if threshold.is_some() => {
+                    let still = self.window.displacement(self.target) == [0.0; 3];
+                    return still.then(|| self.solver.rest.voxel(self.voxel[0], self.voxel[1], self.voxel[2]));
+                }
+                None if !converged => report.failures += 1,
+                None => {}
+            }
+        }
+        sampler.stored(position)
     }
 }
+
+/// Displacements fill a brick as voxels do.
+const _: () = assert!(DisplacementBrick::offset(EDGE - 1, EDGE - 1, EDGE - 1) + 1 == EDGE * EDGE * EDGE);

@@ -1,105 +1,182 @@
-//! A window of the displacement field around one brick, in index units, padded so that a cell's eight corners are one piece of
-//! memory.
+//! A window of the displacement field around some voxels, in index units, padded so that one register holds one element.
 
 use crate::rows::Box3;
 use maille_chainmail::{ChainMail, DisplacementBrick};
-use maille_displacement::{DisplacementField, FieldSample, trilinear};
+use maille_displacement::{DisplacementField, FieldSample, RowField};
 use maille_volume::brick::EDGE;
+use wide::f32x4;
 
-/// Displacements [voxels] of a box of elements, extended by clamping to the *volume*; the box holds every pre-image.
+/// Displacements [voxels] of a box of elements, extended by clamping; the box holds every pre-image asked for.
+///
+/// Positions are *local*: relative to the window's first element, so that f32 loses nothing far from the grid's first voxel.
 pub struct Window {
     /// first element
-    low: [isize; 3],
-    /// elements along i, j, k
+    low: [usize; 3],
+    /// elements along i, j, k: at least two, a last one is repeated where the volume has only one
     size: [usize; 3],
     u: Vec<[f32; 4]>,
-    /// size of the volume
-    volume: [usize; 3],
+    /// last element and last cell along each axis
+    last: f32x4,
+    last_cell: f32x4,
+    /// whether all displacements are 0
+    at_rest: bool,
 }
 
 impl Window {
     pub fn new() -> Self {
-        Self { low: [0; 3], size: [0; 3], u: Vec::new(), volume: [0; 3] }
+        Self { low: [0; 3], size: [0; 3], u: Vec::new(), last: f32x4::ZERO, last_cell: f32x4::ZERO, at_rest: true }
+    }
+
+    /// First element.
+    pub fn low(&self) -> [usize; 3] {
+        self.low
+    }
+
+    /// Number of elements along each axis.
+    pub fn size(&self) -> [usize; 3] {
+        self.size
+    }
+
+    /// Whether every displacement is zero.
+    pub fn at_rest(&self) -> bool {
+        self.at_rest
     }
 
     /// Copies the elements of a box (inclusive, inside the volume).
     pub fn gather(&mut self, mail: &ChainMail, range: Box3) {
         let layout = mail.layout();
-        self.volume = layout.size;
-        self.low = range.low.map(|v| v as isize);
-        self.size = std::array::from_fn(|c| range.high[c] - range.low[c] + 1);
-        self.u.clear();
+        self.low = range.low;
+        self.size = std::array::from_fn(|c| (range.high[c] - range.low[c] + 1).max(2));
+        self.last = register(self.size.map(|s| (s - 1) as f32));
+        self.last_cell = register(self.size.map(|s| (s - 2) as f32));
         self.u.resize(self.size.iter().product(), [0.0; 4]);
-        let per_mm = mail.spacing().map(|s| 1.0 / s);
+        let per_mm = register(mail.spacing().map(|s| 1.0 / s));
         let bricks = |c: usize| range.low[c] / EDGE..=range.high[c] / EDGE;
+        self.at_rest = true;
         for bk in bricks(2) {
             for bj in bricks(1) {
                 for bi in bricks(0) {
-                    let Some(brick) = mail.displacement_brick(layout.id([bi, bj, bk])) else { continue };
-                    let first = [bi * EDGE, bj * EDGE, bk * EDGE];
-                    let part = |c: usize| first[c].max(range.low[c])..(first[c] + EDGE).min(range.high[c] + 1);
-                    for k in part(2) {
-                        for j in part(1) {
-                            let row = ((k - range.low[2]) * self.size[1] + (j - range.low[1])) * self.size[0];
-                            for i in part(0) {
-                                let n = DisplacementBrick::offset(i - first[0], j - first[1], k - first[2]);
-                                self.u[row + i - range.low[0]] =
-                                    [brick.u[0][n] * per_mm[0], brick.u[1][n] * per_mm[1], brick.u[2][n] * per_mm[2], 0.0];
-                            }
-                        }
-                    }
+                    let id = layout.id([bi, bj, bk]);
+                    let brick = mail.displacement_brick(id).filter(|_| mail.displacement_range(id) != [[0.0; 2]; 3]);
+                    self.at_rest &= brick.is_none();
+                    self.copy_brick(brick, per_mm, [bi, bj, bk].map(|b| b * EDGE), range);
+                }
+            }
+        }
+        // a volume of one voxel along an axis: the cell's upper corners repeat the lower ones
+        let [nx, ny, nz] = self.size;
+        for c in (0..3).filter(|&c| range.high[c] == range.low[c]) {
+            let step = [1, nx, nx * ny][c];
+            for n in (0..nx * ny * nz).filter(|n| n / step % 2 == 1) {
+                self.u[n] = self.u[n - step];
+            }
+        }
+    }
+
+    /// Copies the part of one brick that lies in the window; `None`: it is at rest.
+    fn copy_brick(&mut self, brick: Option<&DisplacementBrick>, per_mm: f32x4, first: [usize; 3], range: Box3) {
+        let part = |c: usize| first[c].max(range.low[c])..(first[c] + EDGE).min(range.high[c] + 1);
+        let (from, count) = (part(0).start, part(0).len());
+        for k in part(2) {
+            for j in part(1) {
+                let row = ((k - range.low[2]) * self.size[1] + (j - range.low[1])) * self.size[0] + from - range.low[0];
+                let out = &mut self.u[row..row + count];
+                let Some(brick) = brick else {
+                    out.fill([0.0; 4]);
+                    continue;
+                };
+                let n = DisplacementBrick::offset(from - first[0], j - first[1], k - first[2]);
+                let [x, y, z] = [0, 1, 2].map(|c| &brick.u[c][n..n + count]);
+                for (i, out) in out.iter_mut().enumerate() {
+                    *out = (register([x[i], y[i], z[i]]) * per_mm).to_array();
                 }
             }
         }
     }
 
-    /// Displacement of an element of the volume [voxels]; beyond the window the nearest one inside.
+    /// Displacement [voxels] of an element, local; beyond the window the nearest one inside.
     #[inline(always)]
     pub fn element(&self, at: [isize; 3]) -> [f32; 3] {
-        let c = |c: usize| (at[c] - self.low[c]).clamp(0, self.size[c] as isize - 1) as usize;
+        let c = |c: usize| at[c].clamp(0, self.size[c] as isize - 1) as usize;
         let [x, y, z, _] = self.u[(c(2) * self.size[1] + c(1)) * self.size[0] + c(0)];
         [x, y, z]
     }
 
-    /// Whether every displacement is zero.
-    pub fn at_rest(&self) -> bool {
-        self.u.iter().all(|u| u[0] == 0.0 && u[1] == 0.0 && u[2] == 0.0)
+    /// Displacements [voxels] of a row of elements, local.
+    #[inline(always)]
+    pub fn row(&self, j: usize, k: usize) -> &[[f32; 4]] {
+        let row = (k * self.size[1] + j) * self.size[0];
+        &self.u[row..row + self.size[0]]
+    }
+
+    /// Flat offset of a cell's lower corner, fractions, and what was clamped.
+    #[inline(always)]
+    fn locate(&self, local: f32x4) -> (usize, [f32x4; 3], f32x4) {
+        // SSE's maximum gives the second operand for a NaN: it becomes 0 here and is caught by the solver's residual
+        let inside = local.fast_max(f32x4::ZERO).fast_min(self.last);
+        let cell = inside.fast_min(self.last_cell).fast_trunc_int();
+        let f = (inside - cell.round_float()).to_array();
+        let [i, j, k, _] = cell.to_array().map(|v| v as usize);
+        // what is no number and no zero (another processor's maximum) must not leave the window
+        let at = ((k * self.size[1] + j) * self.size[0] + i).min(self.u.len() - 2 - self.size[0] * (self.size[1] + 1));
+        (at, [f32x4::splat(f[0]), f32x4::splat(f[1]), f32x4::splat(f[2])], inside)
+    }
+
+    /// The four pairs of neighbours along i around a cell at (j, k) = (0,0), (1,0), (0,1), (1,1).
+    #[inline(always)]
+    fn pairs(&self, at: usize) -> [[f32x4; 2]; 4] {
+        let (row, slice) = (self.size[0], self.size[0] * self.size[1]);
+        let part = &self.u[at..at + slice + row + 2];
+        [0, row, slice, slice + row].map(|n| [f32x4::new(part[n]), f32x4::new(part[n + 1])])
+    }
+}
+
+#[inline(always)]
+fn register([x, y, z]: [f32; 3]) -> f32x4 {
+    f32x4::new([x, y, z, 0.0])
+}
+
+#[inline(always)]
+fn lerp(a: f32x4, b: f32x4, t: f32x4) -> f32x4 {
+    a + (b - a) * t
+}
+
+impl RowField for Window {
+    /// Trilinear between elements at a *local* position.
+    #[inline(always)]
+    fn value(&self, local: f32x4) -> f32x4 {
+        let (at, [x, y, z], _) = self.locate(local);
+        let [a, b, c, d] = self.pairs(at).map(|[low, high]| lerp(low, high, x));
+        lerp(lerp(a, b, y), lerp(c, d, y), z)
+    }
+
+    #[inline(always)]
+    fn jet(&self, local: f32x4) -> (f32x4, [f32x4; 3]) {
+        let (at, [x, y, z], inside) = self.locate(local);
+        let p = self.pairs(at);
+        let [a, b, c, d] = p.map(|[low, high]| lerp(low, high, x));
+        let [da, db, dc, dd] = p.map(|[low, high]| high - low);
+        let (low, high) = (lerp(a, b, y), lerp(c, d, y));
+        // beyond the window the field is constant along the axis that was clamped
+        let kept = (inside - local).to_array();
+        let keep = |c: usize| f32x4::splat(if kept[c] == 0.0 { 1.0 } else { 0.0 });
+        let along_i = lerp(lerp(da, db, y), lerp(dc, dd, y), z) * keep(0);
+        (lerp(low, high, z), [along_i, lerp(b - a, d - c, z) * keep(1), (high - low) * keep(2)])
     }
 }
 
 impl DisplacementField for Window {
-    /// Trilinear between elements; beyond the volume's elements, and beyond the window, extended by clamping.
+    /// Trilinear between elements at a *local* position; beyond the window extended by clamping.
     #[inline]
-    fn at(&self, index: [f32; 3]) -> FieldSample {
-        let (mut base, mut f, mut clamped) = ([0usize; 3], [0.0f32; 3], [false; 3]);
-        for c in 0..3 {
-            let last = (self.size[c] - 1) as f32;
-            let local = index[c] - self.low[c] as f32;
-            // NaN becomes 0 and is caught by the solver's residual
-            let inside = if local > 0.0 { if local < last { local } else { last } } else { 0.0 };
-            clamped[c] = inside != local;
-            base[c] = (inside as usize).min(self.size[c].saturating_sub(2));
-            f[c] = inside - base[c] as f32;
-        }
-        let step = [
-            usize::from(self.size[0] > 1),
-            self.size[0] * usize::from(self.size[1] > 1),
-            self.size[0] * self.size[1] * usize::from(self.size[2] > 1),
-        ];
-        let at = (base[2] * self.size[1] + base[1]) * self.size[0] + base[0];
-        let corner = |n: usize| {
-            let [x, y, z, _] = self.u[at + (n & 1) * step[0] + (n >> 1 & 1) * step[1] + (n >> 2) * step[2]];
-            [x, y, z]
-        };
-        let corners: [[f32; 3]; 8] = std::array::from_fn(corner);
-        let mut out = trilinear(&corners, f);
-        for row in &mut out.jacobian {
-            for c in 0..3 {
-                if clamped[c] {
-                    row[c] = 0.0;
-                }
-            }
-        }
-        out
+    fn at(&self, local: [f32; 3]) -> FieldSample {
+        let (u, slopes) = self.jet(register(local));
+        let ([x, y, z, _], s) = (u.to_array(), slopes.map(f32x4::to_array));
+        FieldSample { u: [x, y, z], jacobian: std::array::from_fn(|c| std::array::from_fn(|d| s[d][c])) }
+    }
+
+    #[inline]
+    fn displacement(&self, local: [f32; 3]) -> [f32; 3] {
+        let [x, y, z, _] = self.value(register(local)).to_array();
+        [x, y, z]
     }
 }

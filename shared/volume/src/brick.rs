@@ -76,19 +76,27 @@ impl Brick {
 
     /// Recomputes the skip cells from the voxels; call it last when a brick was rewritten.
     pub fn summarise(&mut self) {
-        for c in 0..CELLS {
-            let (ci, cj, ck) = (c % CELLS_EDGE * CELL, c / CELLS_EDGE % CELLS_EDGE * CELL, c / (CELLS_EDGE * CELLS_EDGE) * CELL);
-            let (mut low, mut high) = (i16::MAX, i16::MIN);
-            for k in ck..=ck + CELL {
-                for j in cj..=cj + CELL {
-                    let start = Self::offset(ci as isize, j as isize, k as isize);
-                    for &v in &self.voxels[start..=start + CELL] {
-                        low = low.min(v);
-                        high = high.max(v);
+        const WIDTH: usize = EDGE + 1;
+        for ck in 0..CELLS_EDGE {
+            for cj in 0..CELLS_EDGE {
+                // whole rows first, which vectorises, then the cells along i
+                let (mut low, mut high) = ([i16::MAX; WIDTH], [i16::MIN; WIDTH]);
+                for k in ck * CELL..=ck * CELL + CELL {
+                    for j in cj * CELL..=cj * CELL + CELL {
+                        let start = Self::offset(0, j as isize, k as isize);
+                        for (i, &v) in self.voxels[start..start + WIDTH].iter().enumerate() {
+                            low[i] = low[i].min(v);
+                            high[i] = high[i].max(v);
+                        }
                     }
                 }
+                for ci in 0..CELLS_EDGE {
+                    let part = ci * CELL..=ci * CELL + CELL;
+                    let least = low[part.clone()].iter().fold(i16::MAX, |l, &v| l.min(v));
+                    let most = high[part].iter().fold(i16::MIN, |h, &v| h.max(v));
+                    self.cells[(ck * CELLS_EDGE + cj) * CELLS_EDGE + ci] = [least, most];
+                }
             }
-            self.cells[c] = [low, high];
         }
     }
 

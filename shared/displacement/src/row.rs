@@ -1,0 +1,211 @@
+//! Many points of a row at once: the same fixed point and the same Newton as [`Inverter::invert`], one evaluation of every point
+//! after the other, so that the processor works on a dozen points while one waits for its corners.
+//!
+//! The three components of a point travel in one register of four lanes (the fourth is 0). A row stops when its slowest point
+//! meets the rule. The fixed point gives back X′ = x − u(X), not the X it tested: if u contracts by q and |x − X − u(X)| = r, the
+//! error of X′ is at most q·r/(1 − q), so that r ≤ tolerance·(1 − q)/q is enough.
+//!
+//! Units: index units. Cost: one field evaluation a point and iteration. Not here: damping and searches; points that do not
+//! converge are left to [`Inverter::invert`].
+
+use crate::{
+    FieldSample, Scheme,
+    invert::{Inverter, newton_step},
+};
+use std::ops::Range;
+use wide::f32x4;
+
+/// A displacement field that answers in registers: components in the first three lanes, 0 in the fourth.
+pub trait RowField {
+    /// u(X) at a continuous index.
+    fn value(&self, index: f32x4) -> f32x4;
+    /// u(X) and its derivatives along i, j, k.
+    fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]);
+}
+
+/// Iterations of a row before its slow points are given up: near q = 0.6 eight settle almost all.
+const ROW_ITERATIONS: u32 = 16;
+/// Newton needs two or three; a point that takes more wants damping.
+const ROW_NEWTON: u32 = 6;
+
+impl Inverter {
+    /// Inverts the points `range` of a row, in place from their starts. `converged` tells which met the rule. Returns the number of
+    /// field evaluations.
+    #[inline]
+    pub fn invert_row<const N: usize>(
+        &self,
+        field: &impl RowField,
+        target: &[f32x4; N],
+        range: Range<usize>,
+        position: &mut [f32x4; N],
+        converged: &mut [bool; N],
+    ) -> u32 {
+        match self.scheme {
+            Scheme::FixedPoint => self.fixed_point_row(field, target, range, position, converged),
+            Scheme::Newton => self.newton_row(field, target, range, position, converged),
+        }
+    }
+
+    #[inline]
+    fn fixed_point_row<const N: usize>(
+        &self,
+        field: &impl RowField,
+        target: &[f32x4; N],
+        range: Range<usize>,
+        position: &mut [f32x4; N],
+        converged: &mut [bool; N],
+    ) -> u32 {
+        let stop = self.stop() / self.contraction;
+        let weight = weights(self.weight);
+        let mut residual = [f32x4::ZERO; N];
+        let mut evaluations = 0;
+        for _ in 0..ROW_ITERATIONS {
+            let mut worst = f32x4::ZERO;
+            for n in range.clone() {
+                let next = target[n] - field.value(position[n]);
+                residual[n] = (next - position[n]).abs() * weight;
+                worst = worst.fast_max(residual[n]);
+                position[n] = next;
+            }
+            evaluations += range.len() as u32;
+            if largest(worst) <= stop {
+                break;
+            }
+        }
+        for n in range {
+            converged[n] = largest(residual[n]) <= stop;
+        }
+        evaluations
+    }
+
+    #[inline]
+    fn newton_row<const N: usize>(
+        &self,
+        field: &impl RowField,
+        target: &[f32x4; N],
+        range: Range<usize>,
+        position: &mut [f32x4; N],
+        converged: &mut [bool; N],
+    ) -> u32 {
+        let stop = self.stop();
+        let weight = weights(self.weight);
+        let mut evaluations = 0;
+        for n in range.clone() {
+            converged[n] = false;
+        }
+        for iteration in 0..ROW_NEWTON {
+            let mut open = false;
+            for n in range.clone() {
+                if converged[n] {
+                    continue;
+                }
+                let (u, slopes) = field.jet(position[n]);
+                let r = target[n] - position[n] - u;
+                evaluations += 1;
+                if largest(r.abs() * weight) <= stop {
+                    converged[n] = true;
+                    continue;
+                }
+                open = true;
+                // the last test has no step after it, so that what is returned is what was tested
+                if iteration + 1 < ROW_NEWTON {
+                    position[n] += step(u, &slopes, r);
+                }
+            }
+            if !open {
+                break;
+            }
+        }
+        evaluations
+    }
+}
+
+#[inline(always)]
+fn weights([x, y, z]: [f32; 3]) -> f32x4 {
+    f32x4::new([x, y, z, 0.0])
+}
+
+/// Largest of the three lanes; infinite where one is not a number.
+#[inline(always)]
+fn largest(v: f32x4) -> f32 {
+    let [x, y, z, _] = v.to_array();
+    let larger = if x > y { x } else { y };
+    let norm = if larger > z { larger } else { z };
+    // a NaN fails every comparison, but must not hide behind the others
+    if x + y + z < f32::INFINITY { norm } else { f32::INFINITY }
+}
+
+#[inline(always)]
+fn step(u: f32x4, slopes: &[f32x4; 3], r: f32x4) -> f32x4 {
+    let (u, r, s) = (u.to_array(), r.to_array(), slopes.map(f32x4::to_array));
+    let jacobian = std::array::from_fn(|c| std::array::from_fn(|d| s[d][c]));
+    let [x, y, z] = newton_step(&FieldSample { u: [u[0], u[1], u[2]], jacobian }, [r[0], r[1], r[2]]);
+    f32x4::new([x, y, z, 0.0])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::DisplacementField;
+
+    /// u = a·sin(x + y + z + c): rows of the Jacobian sum to 3a = q.
+    struct Wave(f32);
+
+    impl DisplacementField for Wave {
+        fn at(&self, x: [f32; 3]) -> FieldSample {
+            let phase = x[0] + x[1] + x[2];
+            let u = std::array::from_fn(|c| self.0 * (phase + c as f32).sin());
+            FieldSample { u, jacobian: std::array::from_fn(|c| [self.0 * (phase + c as f32).cos(); 3]) }
+        }
+    }
+
+    impl RowField for Wave {
+        fn value(&self, x: f32x4) -> f32x4 {
+            self.jet(x).0
+        }
+        fn jet(&self, x: f32x4) -> (f32x4, [f32x4; 3]) {
+            let [i, j, k, _] = x.to_array();
+            let s = self.at([i, j, k]);
+            let pack = |v: [f32; 3]| f32x4::new([v[0], v[1], v[2], 0.0]);
+            (pack(s.u), std::array::from_fn(|d| pack(std::array::from_fn(|c| s.jacobian[c][d]))))
+        }
+    }
+
+    #[test]
+    fn a_row_finds_what_single_points_find_within_the_tolerance() {
+        for (scheme, q) in [(Scheme::FixedPoint, 0.6), (Scheme::Newton, 0.6), (Scheme::Newton, 0.9)] {
+            let field = Wave(q / 3.0);
+            let inverter = Inverter { scheme, tolerance: 1e-3, contraction: q, weight: [1.0; 3], max_iterations: 100 };
+            let truth: [f32x4; 16] = std::array::from_fn(|n| f32x4::new([n as f32 * 0.37, 2.0 - n as f32 * 0.21, n as f32 * 0.05, 0.0]));
+            let target = truth.map(|x| x + field.value(x));
+            let (mut position, mut converged) = (target, [false; 16]);
+            // what lies outside the range is left alone
+            let evaluations = inverter.invert_row(&field, &target, 2..15, &mut position, &mut converged);
+            assert!(evaluations >= 13 && position[0] == target[0] && position[15] == target[15] && !converged[15]);
+            for n in 2..15 {
+                assert!(converged[n], "{scheme:?} {q}");
+                // the rule bounds the error itself
+                assert!(largest((position[n] - truth[n]).abs()) <= 1e-3, "{scheme:?} {q} {n}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_no_number_is_not_converged() {
+        struct Broken;
+        impl RowField for Broken {
+            fn value(&self, _: f32x4) -> f32x4 {
+                f32x4::splat(f32::NAN)
+            }
+            fn jet(&self, _: f32x4) -> (f32x4, [f32x4; 3]) {
+                (f32x4::splat(f32::NAN), [f32x4::splat(f32::NAN); 3])
+            }
+        }
+        for scheme in [Scheme::FixedPoint, Scheme::Newton] {
+            let inverter = Inverter { scheme, tolerance: 1e-3, contraction: 0.6, weight: [1.0; 3], max_iterations: 9 };
+            let (mut position, mut converged) = ([f32x4::ZERO; 4], [true; 4]);
+            inverter.invert_row(&Broken, &[f32x4::ZERO; 4], 0..4, &mut position, &mut converged);
+            assert_eq!(converged, [false; 4]);
+        }
+    }
+}
