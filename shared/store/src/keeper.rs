@@ -3,14 +3,15 @@
 use crate::{
     DISPLACEMENT_LEN, STATE_BYTES, StoreError, StoreSizes,
     layout::{first_entry, index_layout},
+    protocol::publish,
     raw::{IndexMap, Slots},
 };
-use maille_contract::index::{ABSENT, Channel, LEAF_LEN, NEVER, ROOT_BITS};
+use maille_contract::index::{ABSENT, Channel, LEAF_LEN, NEVER};
 use maille_contract::names::segment;
 use maille_transport::Domain;
 use maille_volume::{Brick, BrickId, BrickLayout, Volume, VolumeInfo, brick::fill_from_volume};
 use rayon::prelude::*;
-use std::sync::atomic::Ordering::{Relaxed, SeqCst};
+use std::sync::atomic::Ordering::Relaxed;
 
 /// What a store should hold.
 #[derive(Clone, Debug)]
@@ -107,6 +108,6 @@ impl StoreKeeper {
         }
         index.slot_records(Channel::State as usize)[0].superseded.store(NEVER, Relaxed);
         index.root_records()[0].superseded.store(NEVER, Relaxed);
-        index.head().store(1 << ROOT_BITS, SeqCst);
+        publish(index.head(), 1, 0);
     }
 }

@@ -1,7 +1,7 @@
 //! Sizes and offsets of the store's segments, computed alike by whoever makes and whoever opens it.
 
 use crate::StoreError;
-use maille_contract::index::{Channel, ChannelLayout, IndexHeader, IndexLayout, LEAF_LEN, ROOT_BITS, SlotRecord};
+use maille_contract::index::{ABSENT, Channel, ChannelLayout, IndexHeader, IndexLayout, LEAF_LEN, ROOT_BITS, SlotRecord};
 use maille_volume::{Brick, BrickLayout, Grid, Rescale, VolumeInfo, brick};
 
 /// Numbers of a displacement brick: three components, each EDGE³ voxels, i fastest.
@@ -114,6 +114,15 @@ pub(crate) fn checked(l: IndexLayout, sum: u64) -> Result<(IndexLayout, VolumeIn
     if sizes != [size_of::<Brick>() as u64, DISPLACEMENT_LEN as u64 * 4, STATE_BYTES as u64] || voxels.entry_count != bricks.count() as u64
     {
         return fail("the channels have other sizes".into());
+    }
+    let entries: u64 = [voxels, displacement, state].iter().map(|c| c.entry_count).sum();
+    if voxels.slot_count < voxels.entry_count
+        || ![0, voxels.entry_count].contains(&displacement.entry_count)
+        || state.entry_count != 1
+        || [voxels, displacement, state].iter().any(|c| c.slot_count >= u64::from(ABSENT))
+        || l.root_len != entries.div_ceil(LEAF_LEN as u64)
+    {
+        return fail("the channels have other counts".into());
     }
     if l.root_count >= 1 << ROOT_BITS || l.leaf_count >= 1 << 31 || l.root_len >= 1 << 31 {
         return fail("too many index pages".into());

@@ -10,13 +10,13 @@
 //!   `commit()` publishes all at once; a dropped transaction leaves no trace.
 //! - `reader.snapshot()` is wait-free: a handful of steps, whatever the writer does. `snapshot.brick(id)` is a reference into
 //!   shared memory, never a copy.
+//! - A reader that is stopped, anywhere, costs at most one version of each brick; the writer never waits for it.
 //! - No free slot (a slow or stopped reader)? The commit is put off and merged into the next one; the writer goes on.
 //! - The committed store is the recovery: [`Writer::open`] finds exactly the last commit, whatever its predecessor was doing.
 //!
 //! # The protocol's one race, and why it is none
-//! A reader stores PENDING in its pin, loads the head, stores what it loaded. The writer stores the head, then reads the
-//! pins. Both sides use sequentially consistent operations, so either the writer sees PENDING (and reclaims nothing), or
-//! the reader's load comes after the writer's store and so pins an epoch that the writer has taken into account.
+//! A reader chooses an epoch while the writer decides what nobody sees any more. The module `protocol` holds these steps and the
+//! argument; `tests/model.rs` checks them under loom, `tests/kills.rs` with processes that die in the middle of them.
 //!
 //! # Layout
 //! Five segments (DESIGN D12): the index, rest bricks, brick versions, displacement, state. The first index points at the rest
@@ -26,18 +26,34 @@
 
 #![deny(unsafe_code)]
 
+mod audit;
+#[cfg_attr(not(feature = "fault-points"), allow(dead_code))]
+#[doc(hidden)]
+pub mod fault;
 mod keeper;
 mod layout;
+#[doc(hidden)]
+pub mod protocol;
+mod publish;
 mod raw;
 mod reader;
+mod recover;
+mod transaction;
 mod writer;
+
+pub use audit::Audit;
 
 pub use keeper::{StoreKeeper, StorePlan};
 pub use layout::{DISPLACEMENT_LEN, STATE_BYTES, StoreSizes};
 pub use reader::{Reader, RestBricks, Snapshot, volume_info};
-pub use writer::{CommitOutcome, Transaction, Writer};
+pub use transaction::{CommitOutcome, Transaction};
+pub use writer::Writer;
 
+use maille_contract::{Role, control::PINS, names::PINS_PER_ROLE};
 use thiserror::Error;
+
+/// Pins that belong to no role: for recorders, tests and other programs that read beside the services.
+pub const FREE_PINS: std::ops::Range<usize> = PINS_PER_ROLE * Role::ALL.len()..PINS;
 
 /// Why a store could not be made or opened.
 #[derive(Debug, Error)]

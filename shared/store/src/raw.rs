@@ -181,6 +181,16 @@ impl<T: Pod> Slots<T> {
         unsafe { &mut *self.pointer(slot) }
     }
 
+    /// Copies one slot's content to another slot, which is free.
+    #[inline]
+    pub fn copy(&mut self, from: usize, to: usize) {
+        assert_ne!(from, to, "a version in use was taken for free");
+        let (from, to) = (self.pointer(from).cast_const(), self.pointer(to));
+        // SAFETY: both are valid and aligned (as in `get`), and different slots do not overlap; nobody else writes `from`, and
+        // nobody at all uses `to`, which is free.
+        unsafe { from.copy_to_nonoverlapping(to, 1) }
+    }
+
     /// All slots, to be filled before the store is sealed.
     pub fn all_mut(&mut self) -> &mut [T] {
         match self.count {

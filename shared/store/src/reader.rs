@@ -2,16 +2,21 @@
 
 use crate::{
     DISPLACEMENT_LEN, STATE_BYTES, StoreError,
+    fault::{Point, point},
     layout::first_entry,
+    protocol::{Step, epoch_of, pin, root_of, unpin},
     raw::{IndexMap, Slots},
 };
-use maille_contract::control::{PIN_IDLE, PIN_PENDING, Pin};
-use maille_contract::index::{ABSENT, Channel, LEAF_LEN, ROOT_BITS};
+use maille_contract::control::{PINS, Pin};
+use maille_contract::index::{ABSENT, Channel, LEAF_LEN};
 use maille_contract::names::segment;
 use maille_contract::{ControlBlock, Role};
 use maille_transport::{Access, ControlMap, Domain};
 use maille_volume::{Brick, BrickId, BrickLayout, BrickSource, VolumeInfo};
-use std::sync::atomic::Ordering::{Relaxed, Release, SeqCst};
+use std::{
+    ops::Range,
+    sync::atomic::Ordering::{Acquire, Relaxed},
+};
 
 /// A process's read-only view of the store.
 pub struct Reader {
@@ -23,7 +28,7 @@ pub struct Reader {
     versions: Slots<Brick>,
     displacement: Slots<[f32; DISPLACEMENT_LEN]>,
     state: Slots<[u8; STATE_BYTES]>,
-    role: Role,
+    pins: Range<usize>,
     first_displacement: usize,
     first_state: usize,
 }
@@ -42,6 +47,21 @@ impl Reader {
     /// # Errors
     /// When a segment is missing, truncated or of another version.
     pub fn open(domain: &Domain, role: Role) -> Result<Self, StoreError> {
+        Self::open_with_pins(domain, role.pins())
+    }
+
+    /// As [`Reader::open`], with pins of its own for a program that is none of the run's roles. Those that belong to no role are
+    /// [`FREE_PINS`](crate::FREE_PINS); who shares them out also releases them when a reader has died.
+    ///
+    /// # Errors
+    /// As [`Reader::open`].
+    ///
+    /// # Panics
+    /// When there are no such pins.
+    pub fn open_with_pins(domain: &Domain, pins: Range<usize>) -> Result<Self, StoreError> {
+        assert!(!pins.is_empty() && pins.end <= PINS, "pins {pins:?} of {PINS}");
+        #[cfg(feature = "fault-points")]
+        crate::fault::arm();
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::Read)?;
         let [voxels, displacement, state] = index.layout.channels;
@@ -57,7 +77,7 @@ impl Reader {
             index,
             info,
             layout,
-            role,
+            pins,
         })
     }
 
@@ -73,24 +93,25 @@ impl Reader {
 
     /// The newest committed epoch.
     pub fn epoch(&self) -> u64 {
-        self.index.head().load(SeqCst) >> ROOT_BITS
+        epoch_of(self.index.head().load(Acquire))
     }
 
-    /// Pins the newest epoch. Wait-free: at most as many steps as the role has pins.
+    /// Pins the newest epoch. Wait-free: at most as many steps as the reader has pins, whatever the writer does.
     ///
     /// # Panics
-    /// When the role holds all of its pins already: snapshots are being kept that should have been dropped.
+    /// When the reader holds all of its pins already: snapshots are being kept that should have been dropped.
     #[inline]
     pub fn snapshot(&self) -> Snapshot<'_> {
-        let pins = &self.control.pins[self.role.pins()];
-        let free =
-            |pin: &&Pin| pin.word.load(Relaxed) == PIN_IDLE && pin.word.compare_exchange(PIN_IDLE, PIN_PENDING, SeqCst, Relaxed).is_ok();
-        let pin = pins.iter().find(free).expect("a role holds at most as many snapshots as it has pins");
-        // SYNC POINT: PENDING, then this load ↔ `Writer::publish`'s store of the head, then its look at the pins.
-        let head = self.index.head().load(SeqCst);
-        pin.word.store(head, Release);
-        let root = (head & ((1 << ROOT_BITS) - 1)) as usize;
-        Snapshot { reader: self, pin, head, root }
+        let at = |step| {
+            point(match step {
+                Step::Pending => Point::PinPending,
+                Step::Loaded => Point::HeadLoaded,
+                Step::Pinned => Point::Pinned,
+            });
+        };
+        let pinned = pin(&self.control.pins[self.pins.clone()], self.index.head(), at);
+        let (pin, head) = pinned.expect("a reader holds at most as many snapshots as it has pins");
+        Snapshot { reader: self, pin, head, root: root_of(head) }
     }
 
     /// The volume at rest, as it was loaded.
@@ -99,7 +120,7 @@ impl Reader {
     }
 
     /// Address ranges of the mapped voxels (rest, versions): what a reader dereferences lies inside.
-    pub fn voxel_addresses(&self) -> [std::ops::Range<usize>; 2] {
+    pub fn voxel_addresses(&self) -> [Range<usize>; 2] {
         [self.rest.addresses(), self.versions.addresses()]
     }
 }
@@ -115,7 +136,7 @@ pub struct Snapshot<'a> {
 impl Snapshot<'_> {
     /// The epoch that is pinned.
     pub fn epoch(&self) -> u64 {
-        self.head >> ROOT_BITS
+        epoch_of(self.head)
     }
 
     #[inline]
@@ -165,8 +186,8 @@ impl BrickSource for Snapshot<'_> {
 impl Drop for Snapshot<'_> {
     #[inline]
     fn drop(&mut self) {
-        // SYNC POINT: what was read from the slots happens before the writer sees the pin gone and reuses them.
-        self.pin.word.store(PIN_IDLE, Release);
+        unpin(self.pin);
+        point(Point::Unpinned);
     }
 }
 

@@ -1,74 +1,63 @@
-//! Writing: transactions, commits, reclaiming, recovery.
+//! The writer: what it holds, and what it knows of the committed state.
 
 use crate::{
-    DISPLACEMENT_LEN, RestBricks, STATE_BYTES, StoreError,
+    DISPLACEMENT_LEN, RestBricks, STATE_BYTES, StoreError, Transaction,
     layout::first_entry,
+    protocol::{epoch_of, root_of},
     raw::{IndexMap, Slots},
+    transaction::{CommitOutcome, Edit, Version},
 };
-use bytemuck::{Pod, Zeroable};
 use maille_contract::ControlBlock;
-use maille_contract::control::{PIN_IDLE, PIN_PENDING};
-use maille_contract::index::{ABSENT, Channel, LEAF_LEN, NEVER, ROOT_BITS, SlotRecord};
+use maille_contract::index::{ABSENT, Channel, LEAF_LEN, SlotRecord};
 use maille_contract::names::segment;
 use maille_transport::{Access, ControlMap, Domain};
 use maille_volume::{Brick, BrickId, BrickLayout, VolumeInfo};
-use std::{
-    collections::BTreeMap,
-    sync::atomic::Ordering::{Relaxed, Release, SeqCst},
-};
-
-/// A new version being written: in a free slot, or on the heap while there is none.
-enum Edit {
-    Slot(u32),
-    /// bytes of the version, in words so that any slot type is aligned
-    Heap(Box<[u64]>),
-}
+use std::sync::atomic::Ordering::Relaxed;
 
 /// What lives for a number of epochs: slots of the three channels, leaf pages, root pages.
-const KINDS: usize = 5;
-const LEAVES: usize = 3;
-const ROOTS: usize = 4;
+pub(crate) const KINDS: usize = 5;
+pub(crate) const LEAVES: usize = 3;
+pub(crate) const ROOTS: usize = 4;
+pub(crate) const KIND_NAMES: [&str; KINDS] = ["voxel slots", "displacement slots", "state slots", "leaf pages", "root pages"];
 
 /// Something superseded that a pin may still show.
-struct Retired {
-    kind: usize,
-    number: u32,
-    born: u64,
-    superseded: u64,
+pub(crate) struct Retired {
+    pub kind: usize,
+    pub number: u32,
+    pub born: u64,
+    pub superseded: u64,
+}
+
+/// What a commit changes: the new version of something and the one it supersedes.
+pub(crate) struct Change {
+    pub kind: usize,
+    pub new: u32,
+    pub old: u32,
 }
 
 /// The one writer.
 pub struct Writer {
-    control: ControlMap,
-    index: IndexMap,
+    pub(crate) control: ControlMap,
+    pub(crate) index: IndexMap,
     info: VolumeInfo,
-    layout: BrickLayout,
-    rest: Slots<Brick>,
-    versions: Slots<Brick>,
-    displacement: Slots<[f32; DISPLACEMENT_LEN]>,
-    state: Slots<[u8; STATE_BYTES]>,
+    pub(crate) layout: BrickLayout,
+    pub(crate) rest: Slots<Brick>,
+    pub(crate) versions: Slots<Brick>,
+    pub(crate) displacement: Slots<[f32; DISPLACEMENT_LEN]>,
+    pub(crate) state: Slots<[u8; STATE_BYTES]>,
     /// free slots and pages, by kind
-    free: [Vec<u32>; KINDS],
-    retired: Vec<Retired>,
-    /// committed by the caller, but not yet published for want of slots
-    deferred: BTreeMap<usize, Edit>,
-    first: [usize; 3],
-}
-
-/// What a commit came to.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum CommitOutcome {
-    /// visible to every snapshot taken from now on
-    Published {
-        /// its epoch
-        epoch: u64,
-        /// entries (bricks, displacement bricks, state) with a new version
-        entries: usize,
-    },
-    /// no slot was free: kept, and part of the next commit
-    Deferred,
-    /// nothing was changed
-    Empty,
+    pub(crate) free: [Vec<u32>; KINDS],
+    pub(crate) retired: Vec<Retired>,
+    /// committed by the caller, but not yet published for want of slots; in order of entries
+    pub(crate) deferred: Vec<Edit>,
+    /// place of an entry in the edits of the transaction that is open, plus one; 0 where it has none
+    pub(crate) place: Vec<u32>,
+    /// memory of the next transaction's edits and of the next commit's changes, kept to be used again
+    pub(crate) spare_edits: Vec<Edit>,
+    pub(crate) changes: Vec<Change>,
+    pub(crate) first: [usize; 3],
+    /// most entries of each channel that one transaction has changed so far
+    pub(crate) largest: [usize; 3],
 }
 
 impl Writer {
@@ -76,17 +65,21 @@ impl Writer {
     /// The caller (by the supervisor's word) is the only writer.
     ///
     /// # Errors
-    /// When a segment is missing, truncated or of another version.
+    /// When a segment is missing, truncated, damaged or of another version.
     pub fn open(domain: &Domain) -> Result<Self, StoreError> {
+        #[cfg(feature = "fault-points")]
+        crate::fault::arm();
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::ReadWrite)?;
-        let [voxels, displacement, state] = index.layout.channels;
-        let spare = (voxels.slot_count - voxels.entry_count) as usize;
+        let channels = index.layout.channels;
+        let [voxels, displacement, state] = channels.map(|c| c.slot_count as usize);
+        let spare = voxels - channels[0].entry_count as usize;
+        let entries: u64 = channels.iter().map(|c| c.entry_count).sum();
         let mut writer = Self {
             rest: Slots::open(domain, segment::REST, layout.count(), Access::Read, true)?,
             versions: Slots::open(domain, segment::VERSIONS, spare, Access::ReadWrite, false)?,
-            displacement: Slots::open(domain, segment::DISPLACEMENT, displacement.slot_count as usize, Access::ReadWrite, false)?,
-            state: Slots::open(domain, segment::STATE, state.slot_count as usize, Access::ReadWrite, false)?,
+            displacement: Slots::open(domain, segment::DISPLACEMENT, displacement, Access::ReadWrite, false)?,
+            state: Slots::open(domain, segment::STATE, state, Access::ReadWrite, false)?,
             first: [Channel::Voxels, Channel::Displacement, Channel::State].map(|c| first_entry(&index.layout, c)),
             control,
             index,
@@ -94,9 +87,13 @@ impl Writer {
             layout,
             free: Default::default(),
             retired: Vec::new(),
-            deferred: BTreeMap::new(),
+            deferred: Vec::new(),
+            place: vec![0; entries as usize],
+            spare_edits: Vec::new(),
+            changes: Vec::new(),
+            largest: [0; 3],
         };
-        writer.recover();
+        writer.recover()?;
         Ok(writer)
     }
 
@@ -122,7 +119,7 @@ impl Writer {
 
     /// The last published epoch.
     pub fn epoch(&self) -> u64 {
-        self.index.head().load(SeqCst) >> ROOT_BITS
+        epoch_of(self.index.head().load(Relaxed))
     }
 
     /// Free voxel slots.
@@ -140,6 +137,7 @@ impl Writer {
         if self.index.layout.channels[1].entry_count == 0 {
             return None;
         }
+        assert!((id as usize) < self.layout.count(), "brick {id} of {}", self.layout.count());
         let slot = self.published(self.first[1] + id as usize);
         (slot != ABSENT).then(|| self.displacement.get(slot as usize))
     }
@@ -149,23 +147,44 @@ impl Writer {
         self.state.get(self.published(self.first[2]) as usize)
     }
 
+    /// Publishes what was put off, if that can be done now, and says whether another transaction may be begun. `false` while so
+    /// much waits that with one more like the largest so far it might never find room, not even when all readers let go: then
+    /// the caller does something else and asks again. A caller that never asks loses nothing, but may stay invisible.
+    pub fn has_room(&mut self) -> bool {
+        if self.deferred.is_empty() || matches!(self.begin().commit(), CommitOutcome::Published { .. }) {
+            return true;
+        }
+        (0..3).all(|channel| {
+            let rest = if channel == 0 { self.layout.count() } else { 0 };
+            let slots = self.index.layout.channels[channel].slot_count as usize - rest;
+            let (mut waiting, mut in_slots) = (0, 0);
+            for edit in self.deferred.iter().filter(|e| e.channel == channel) {
+                waiting += 1;
+                in_slots += usize::from(matches!(edit.version, Version::Slot(_)));
+            }
+            let retired = self.retired.iter().filter(|r| r.kind == channel).count();
+            let shown = slots - self.free[channel].len() - retired - in_slots;
+            shown + waiting + self.largest[channel] <= slots
+        })
+    }
+
     /// Starts a transaction.
     pub fn begin(&mut self) -> Transaction<'_> {
         self.reclaim();
-        Transaction { writer: self, edits: BTreeMap::new() }
+        Transaction::new(self)
     }
 
-    fn root_page(&self) -> usize {
-        (self.index.head().load(SeqCst) & ((1 << ROOT_BITS) - 1)) as usize
+    pub(crate) fn root_page(&self) -> usize {
+        root_of(self.index.head().load(Relaxed))
     }
 
     /// Slot that the last published epoch shows for an entry.
-    fn published(&self, entry: usize) -> u32 {
+    pub(crate) fn published(&self, entry: usize) -> u32 {
         let leaf = self.index.root(self.root_page())[entry / LEAF_LEN].load(Relaxed);
         self.index.leaf(leaf as usize)[entry % LEAF_LEN].load(Relaxed)
     }
 
-    fn records(&self, kind: usize) -> &[SlotRecord] {
+    pub(crate) fn records(&self, kind: usize) -> &[SlotRecord] {
         match kind {
             LEAVES => self.index.leaf_records(),
             ROOTS => self.index.root_records(),
@@ -173,103 +192,11 @@ impl Writer {
         }
     }
 
-    fn channel_of(&self, entry: usize) -> usize {
+    pub(crate) fn channel_of(&self, entry: usize) -> usize {
         (0..3).rev().find(|&c| entry >= self.first[c] && self.index.layout.channels[c].entry_count > 0).expect("entries start at 0")
     }
 
-    /// Frees what no pin shows any more. Does nothing while a reader is choosing its epoch.
-    fn reclaim(&mut self) {
-        // SYNC POINT: the head was stored (SeqCst) before these loads ↔ `Reader::snapshot`'s PENDING before its load of the head.
-        let mut pinned = [0u64; maille_contract::control::PINS];
-        let mut count = 0;
-        for pin in &self.control.pins {
-            match pin.word.load(SeqCst) {
-                PIN_IDLE => {}
-                PIN_PENDING => return,
-                head => {
-                    pinned[count] = head >> ROOT_BITS;
-                    count += 1;
-                }
-            }
-        }
-        let visible = |r: &Retired| pinned[..count].iter().any(|&p| r.born <= p && p < r.superseded);
-        let retired = std::mem::take(&mut self.retired);
-        for r in retired {
-            if visible(&r) {
-                self.retired.push(r);
-            } else {
-                self.records(r.kind)[r.number as usize].superseded.store(0, Relaxed);
-                self.free[r.kind].push(r.number);
-            }
-        }
-    }
-
-    /// Rebuilds free lists and retired slots from the published root and the records.
-    fn recover(&mut self) {
-        let epoch = self.epoch();
-        let layout = self.index.layout;
-        let mut live: [Vec<bool>; KINDS] = [
-            vec![false; layout.channels[0].slot_count as usize],
-            vec![false; layout.channels[1].slot_count as usize],
-            vec![false; layout.channels[2].slot_count as usize],
-            vec![false; layout.leaf_count as usize],
-            vec![false; layout.root_count as usize],
-        ];
-        let root = self.root_page();
-        live[ROOTS][root] = true;
-        for (n, leaf) in self.index.root(root).iter().enumerate() {
-            let leaf = leaf.load(Relaxed) as usize;
-            live[LEAVES][leaf] = true;
-            for (m, word) in self.index.leaf(leaf).iter().enumerate() {
-                let (entry, slot) = (n * LEAF_LEN + m, word.load(Relaxed));
-                if slot != ABSENT {
-                    live[self.channel_of(entry)][slot as usize] = true;
-                }
-            }
-        }
-        // rest slots are never reused: they are the volume that the mapper samples
-        live[0][..self.layout.count()].fill(true);
-        let (mut free, mut retired) = (<[Vec<u32>; KINDS]>::default(), Vec::new());
-        for kind in 0..KINDS {
-            for (number, record) in self.records(kind).iter().enumerate().rev() {
-                let (born, superseded) = (record.born.load(Relaxed), record.superseded.load(Relaxed));
-                if live[kind][number] {
-                    record.superseded.store(NEVER, Relaxed);
-                } else if superseded == 0 || born > epoch {
-                    // free, or part of a transaction that was never published
-                    record.superseded.store(0, Relaxed);
-                    free[kind].push(number as u32);
-                } else {
-                    // the predecessor may have died between publishing and saying what that superseded: then it was the last epoch
-                    let superseded = superseded.min(epoch);
-                    record.superseded.store(superseded, Relaxed);
-                    retired.push(Retired { kind, number: number as u32, born, superseded });
-                }
-            }
-        }
-        (self.free, self.retired) = (free, retired);
-        self.reclaim();
-        self.note_spare();
-    }
-
-    fn note_spare(&self) {
-        self.control.spare_slots_low.fetch_min(self.free[0].len() as u64, Relaxed);
-    }
-
-    /// Bytes of the version that a reader of `entry` would see if everything committed so far were published.
-    fn committed_bytes(&self, entry: usize) -> Option<&[u8]> {
-        let channel = self.channel_of(entry);
-        match self.deferred.get(&entry) {
-            Some(Edit::Heap(words)) => Some(&bytemuck::cast_slice(words)[..self.index.layout.channels[channel].slot_bytes as usize]),
-            Some(Edit::Slot(slot)) => Some(self.slot_bytes(channel, *slot)),
-            None => match self.published(entry) {
-                ABSENT => None,
-                slot => Some(self.slot_bytes(channel, slot)),
-            },
-        }
-    }
-
-    fn slot_bytes(&self, channel: usize, slot: u32) -> &[u8] {
+    pub(crate) fn slot_bytes(&self, channel: usize, slot: u32) -> &[u8] {
         let rest = self.layout.count();
         match (channel, slot as usize) {
             (0, slot) if slot < rest => bytemuck::bytes_of(self.rest.get(slot)),
@@ -279,7 +206,7 @@ impl Writer {
         }
     }
 
-    fn slot_bytes_mut(&mut self, channel: usize, slot: u32) -> &mut [u8] {
+    pub(crate) fn slot_bytes_mut(&mut self, channel: usize, slot: u32) -> &mut [u8] {
         let rest = self.layout.count();
         match (channel, slot as usize) {
             (0, slot) => bytemuck::bytes_of_mut(self.versions.get_mut(slot - rest)),
@@ -288,195 +215,18 @@ impl Writer {
         }
     }
 
-    /// Gives back what an edit held.
-    fn release(&mut self, channel: usize, edit: Edit) {
-        if let Edit::Slot(slot) = edit {
-            self.free[channel].push(slot);
+    /// Copies a version into a free slot of its channel, inside shared memory.
+    pub(crate) fn copy_slot(&mut self, channel: usize, from: u32, to: u32) {
+        let rest = self.layout.count();
+        match (channel, from as usize, to as usize) {
+            (0, from, to) if from < rest => self.versions.get_mut(to - rest).clone_from(self.rest.get(from)),
+            (0, from, to) => self.versions.copy(from - rest, to - rest),
+            (1, from, to) => self.displacement.copy(from, to),
+            (_, from, to) => self.state.copy(from, to),
         }
     }
 
-    /// Makes all of `deferred` visible at once; `None` when slots or pages are missing (then nothing has changed).
-    fn publish(&mut self) -> Option<(u64, usize)> {
-        let leaves: Vec<usize> = {
-            let mut touched: Vec<usize> = self.deferred.keys().map(|e| e / LEAF_LEN).collect();
-            touched.dedup();
-            touched
-        };
-        let mut wanted = [0usize; KINDS];
-        for (&entry, edit) in &self.deferred {
-            wanted[self.channel_of(entry)] += usize::from(matches!(edit, Edit::Heap(_)));
-        }
-        (wanted[LEAVES], wanted[ROOTS]) = (leaves.len(), 1);
-        if (0..KINDS).any(|k| self.free[k].len() < wanted[k]) {
-            self.reclaim();
-            if (0..KINDS).any(|k| self.free[k].len() < wanted[k]) {
-                return None;
-            }
-        }
-        let epoch = self.epoch() + 1;
-        let old_root = self.root_page();
-        let edits = std::mem::take(&mut self.deferred);
-        let entries = edits.len();
-        let slots: Vec<(usize, usize, u32)> = edits
-            .into_iter()
-            .map(|(entry, edit)| {
-                let channel = self.channel_of(entry);
-                let slot = match edit {
-                    Edit::Slot(slot) => slot,
-                    Edit::Heap(words) => {
-                        let slot = self.free[channel].pop().expect("counted above");
-                        let bytes = self.slot_bytes_mut(channel, slot);
-                        bytes.copy_from_slice(&bytemuck::cast_slice(&words)[..bytes.len()]);
-                        slot
-                    }
-                };
-                (entry, channel, slot)
-            })
-            .collect();
-        let new_root = self.free[ROOTS].pop().expect("counted above");
-        for (to, from) in self.index.root(new_root as usize).iter().zip(self.index.root(old_root)) {
-            to.store(from.load(Relaxed), Relaxed);
-        }
-        // old → superseded, new → born: (kind, new number, old number)
-        let mut changes: Vec<(usize, u32, u32)> = vec![(ROOTS, new_root, old_root as u32)];
-        for leaf in leaves {
-            let new = self.free[LEAVES].pop().expect("counted above");
-            let word = &self.index.root(new_root as usize)[leaf];
-            let old = word.load(Relaxed);
-            for (to, from) in self.index.leaf(new as usize).iter().zip(self.index.leaf(old as usize)) {
-                to.store(from.load(Relaxed), Relaxed);
-            }
-            word.store(new, Relaxed);
-            changes.push((LEAVES, new, old));
-        }
-        for &(entry, channel, slot) in &slots {
-            let leaf = self.index.root(new_root as usize)[entry / LEAF_LEN].load(Relaxed);
-            let word = &self.index.leaf(leaf as usize)[entry % LEAF_LEN];
-            changes.push((channel, slot, word.load(Relaxed)));
-            word.store(slot, Relaxed);
-        }
-        for &(kind, new, _) in &changes {
-            let record = &self.records(kind)[new as usize];
-            record.born.store(epoch, Relaxed);
-            record.superseded.store(NEVER, Release);
-        }
-        // SYNC POINT: everything above ↔ `Reader::snapshot`'s load of the head. This store is the commit.
-        self.index.head().store(epoch << ROOT_BITS | u64::from(new_root), SeqCst);
-        for (kind, _, old) in changes {
-            let is_rest = kind == 0 && (old as usize) < self.layout.count();
-            if old != ABSENT && !is_rest {
-                let record = &self.records(kind)[old as usize];
-                record.superseded.store(epoch, Relaxed);
-                let born = record.born.load(Relaxed);
-                self.retired.push(Retired { kind, number: old, born, superseded: epoch });
-            }
-        }
-        self.note_spare();
-        Some((epoch, entries))
-    }
-}
-
-/// Changes that become visible together, or not at all.
-pub struct Transaction<'w> {
-    writer: &'w mut Writer,
-    edits: BTreeMap<usize, Edit>,
-}
-
-impl Transaction<'_> {
-    /// A private new version of a brick; at first the current one. Apron and skip cells are the caller's to keep right.
-    ///
-    /// # Panics
-    /// When there is no such brick.
-    pub fn brick_mut(&mut self, id: BrickId) -> &mut Brick {
-        assert!((id as usize) < self.writer.layout.count(), "brick {id} of {}", self.writer.layout.count());
-        self.edit::<Brick>(0, id as usize)
-    }
-
-    /// A private new version of a brick's displacement; at first the current one, or zero.
-    ///
-    /// # Panics
-    /// When there is no such brick, or the store has no displacement channel.
-    pub fn displacement_mut(&mut self, id: BrickId) -> &mut [f32; DISPLACEMENT_LEN] {
-        let entries = self.writer.index.layout.channels[1].entry_count;
-        assert!(u64::from(id) < entries, "displacement brick {id} of {entries}");
-        self.edit::<[f32; DISPLACEMENT_LEN]>(1, id as usize)
-    }
-
-    /// A private new version of the state; at first the current one.
-    pub fn state_mut(&mut self) -> &mut [u8; STATE_BYTES] {
-        self.edit::<[u8; STATE_BYTES]>(2, 0)
-    }
-
-    /// The volume at rest, for the mapper.
-    pub fn rest(&self) -> RestBricks<'_> {
-        self.writer.rest()
-    }
-
-    /// Entries changed so far.
-    pub fn len(&self) -> usize {
-        self.edits.len()
-    }
-
-    /// Whether nothing was changed.
-    pub fn is_empty(&self) -> bool {
-        self.edits.is_empty()
-    }
-
-    fn edit<T: Pod>(&mut self, channel: usize, number: usize) -> &mut T {
-        let entry = self.writer.first[channel] + number;
-        if !self.edits.contains_key(&entry) {
-            let edit = self.start(channel, entry);
-            self.edits.insert(entry, edit);
-        }
-        match self.edits.get_mut(&entry).expect("inserted above") {
-            Edit::Slot(slot) => bytemuck::from_bytes_mut(self.writer.slot_bytes_mut(channel, *slot)),
-            Edit::Heap(words) => bytemuck::from_bytes_mut(&mut bytemuck::cast_slice_mut(words)[..size_of::<T>()]),
-        }
-    }
-
-    /// A copy of the committed version, in a free slot if there is one.
-    fn start(&mut self, channel: usize, entry: usize) -> Edit {
-        let writer = &mut *self.writer;
-        let bytes = writer.index.layout.channels[channel].slot_bytes as usize;
-        // the words are copied once to the heap: the slots of one segment cannot be lent twice, and 14 KiB stay in cache
-        let mut words = vec![0u64; bytes.div_ceil(8)].into_boxed_slice();
-        match writer.committed_bytes(entry) {
-            Some(current) => bytemuck::cast_slice_mut(&mut words)[..bytes].copy_from_slice(current),
-            None => words.fill(u64::zeroed()),
-        }
-        match writer.free[channel].pop() {
-            Some(slot) => {
-                writer.slot_bytes_mut(channel, slot).copy_from_slice(&bytemuck::cast_slice(&words)[..bytes]);
-                Edit::Slot(slot)
-            }
-            None => Edit::Heap(words),
-        }
-    }
-
-    /// Makes all changes visible at once under a new epoch. When no slot is free they are kept and published with the next
-    /// commit; nothing is lost and nobody waits.
-    pub fn commit(mut self) -> CommitOutcome {
-        for (entry, edit) in std::mem::take(&mut self.edits) {
-            if let Some(old) = self.writer.deferred.insert(entry, edit) {
-                let channel = self.writer.channel_of(entry);
-                self.writer.release(channel, old);
-            }
-        }
-        if self.writer.deferred.is_empty() {
-            return CommitOutcome::Empty;
-        }
-        match self.writer.publish() {
-            Some((epoch, entries)) => CommitOutcome::Published { epoch, entries },
-            None => CommitOutcome::Deferred,
-        }
-    }
-}
-
-impl Drop for Transaction<'_> {
-    fn drop(&mut self) {
-        for (entry, edit) in std::mem::take(&mut self.edits) {
-            let channel = self.writer.channel_of(entry);
-            self.writer.release(channel, edit);
-        }
+    pub(crate) fn note_spare(&self) {
+        self.control.spare_slots_low.fetch_min(self.free[0].len() as u64, Relaxed);
     }
 }

@@ -117,6 +117,55 @@ fn when_slots_run_out_the_commit_is_put_off_and_nothing_is_lost() {
 }
 
 #[test]
+fn a_writer_that_asks_for_room_always_gets_visible_again_and_one_that_does_not_loses_nothing() {
+    // 64 bricks, room for 70 versions: a backlog of all bricks beside a version of each would never fit
+    let world = World::new([64, 64, 64], sizes(70));
+    let mut writer = Writer::open(&world.domain).unwrap();
+    let reader = Reader::open(&world.domain, Role::Rendering).unwrap();
+    let mut truth = [0i16; 64];
+    let mut value = 0;
+    let mut push = |writer: &mut Writer, truth: &mut [i16; 64]| {
+        let mut t = writer.begin();
+        for _ in 0..4 {
+            value += 1;
+            let id = value as usize * 5 % 64;
+            t.brick_mut(id as u32).voxels.fill(value);
+            truth[id] = value;
+        }
+        t.commit()
+    };
+    let shows = |truth: &[i16; 64]| {
+        let now = reader.snapshot();
+        (0..64).all(|id| truth[id] == 0 || now.brick(id as u32).voxels.iter().all(|&v| v == truth[id]))
+    };
+    for _ in 0..40 {
+        let stopped = reader.snapshot();
+        let mut pushes = 0;
+        while writer.has_room() && pushes < 100 {
+            push(&mut writer, &mut truth);
+            pushes += 1;
+        }
+        drop(stopped);
+        assert!(writer.has_room() && !writer.has_deferred(), "what was put off is published once the reader has let go");
+        assert!(shows(&truth));
+        writer.audit().unwrap();
+    }
+    // without asking: the backlog may outgrow the store, but it is whole, and the last published state stands
+    let stopped = reader.snapshot();
+    let before = truth;
+    let outcomes: Vec<CommitOutcome> = (0..100).map(|_| push(&mut writer, &mut truth)).collect();
+    assert_eq!(outcomes.last(), Some(&CommitOutcome::Deferred));
+    assert!((0..64).all(|id| before[id] == 0 || stopped.brick(id as u32).voxels[0] == before[id]));
+    let mut t = writer.begin();
+    assert!(
+        (0..64).all(|id| truth[id] == 0 || t.brick_mut(id as u32).voxels[0] == truth[id]),
+        "a transaction starts from all that was committed"
+    );
+    drop(t);
+    writer.audit().unwrap();
+}
+
+#[test]
 fn a_new_writer_finds_the_last_commit_and_every_slot() {
     let world = World::new([96, 64, 64], sizes(256));
     let mut writer = Writer::open(&world.domain).unwrap();

@@ -1,0 +1,162 @@
+//! Tissue that can be checked: every brick carries the epoch, its id, the transaction that wrote it and a checksum; the state
+//! block says which transaction wrote each brick last. So one look at a snapshot tells torn bricks from whole ones, and one
+//! consistent state from a mixture of two.
+
+use maille_store::{DISPLACEMENT_LEN, STATE_BYTES, Snapshot, StoreSizes, Transaction};
+use maille_volume::{Brick, BrickSource, Grid, Rescale, Volume};
+
+/// Voxels along each axis.
+pub const SIZE: usize = 80;
+/// Bricks of the volume.
+pub const BRICKS: usize = 125;
+/// Most bricks that one transaction changes.
+pub const DIRTY: u64 = 24;
+
+/// Room for one version of every brick, another that one stopped reader holds, and a transaction: with eight it runs out now and then.
+pub const SIZES: StoreSizes = StoreSizes { spare_slots: 2 * BRICKS + 2 * DIRTY as usize, displacement_slots: 2 * BRICKS + DIRTY as usize };
+
+/// The volume at rest.
+pub fn volume() -> Volume {
+    let grid = Grid::axis_aligned([SIZE; 3], [1.0; 3]);
+    let voxels = (0..grid.voxel_count()).map(|n| (n % 1999) as i16 - 1000).collect();
+    Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels)
+}
+
+/// splitmix64: a seed gives one sequence, everywhere.
+#[derive(Clone)]
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+
+    /// 0 ≤ … < n.
+    pub fn below(&mut self, n: u64) -> u64 {
+        self.next() % n
+    }
+}
+
+/// What is wrong with a snapshot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u64)]
+pub enum Wrong {
+    /// a brick is not as one transaction wrote it
+    Torn = 1,
+    /// parts of different states
+    Mixed = 2,
+}
+
+/// The state block: what was committed last, and by which transaction each brick and its displacement were written (0: never).
+#[repr(C)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct State {
+    pub transaction: u64,
+    pub epoch: u64,
+    bricks: [u32; BRICKS],
+    displacements: [u32; BRICKS],
+}
+
+impl State {
+    pub fn of(block: &[u8; STATE_BYTES]) -> Self {
+        bytemuck::pod_read_unaligned(&block[..size_of::<Self>()])
+    }
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct Label {
+    epoch: u64,
+    id: u64,
+    transaction: u64,
+    checksum: u64,
+}
+
+const LABEL: usize = size_of::<Label>();
+
+fn checksum(bytes: &[u8], label: &Label) -> u64 {
+    let step = |h: u64, word: u64| (h ^ word).wrapping_mul(0x0100_0000_01B3).rotate_left(23);
+    let words = bytes.chunks(8).map(|c| c.iter().rev().fold(0, |word, &b| word << 8 | u64::from(b)));
+    [label.epoch, label.id, label.transaction].into_iter().chain(words).fold(0xCBF2_9CE4_8422_2325, step)
+}
+
+/// Does what the transaction of that number does, the same whoever does it: a few bricks, some displacements, the state.
+pub fn change(t: &mut Transaction<'_>, seed: u64, transaction: u64, epoch: u64) {
+    let mut random = Random(seed ^ transaction.wrapping_mul(0xD134_2543_DE82_EF95));
+    let mut state = State::of(t.state_mut());
+    for _ in 0..1 + random.below(DIRTY) {
+        let id = random.below(BRICKS as u64);
+        let bytes = bytemuck::bytes_of_mut(&mut t.brick_mut(id as u32).voxels);
+        let (label, rest) = bytes.split_at_mut(LABEL);
+        let mut fill = Random(transaction << 8 ^ id);
+        let word = fill.next().to_le_bytes();
+        rest.chunks_mut(8).for_each(|chunk| chunk.copy_from_slice(&word[..chunk.len()]));
+        // a few words that differ, so that a brick is not one word repeated
+        for _ in 0..16 {
+            let at = fill.below(rest.len() as u64) as usize;
+            rest[at] ^= fill.next() as u8;
+        }
+        let mut new = Label { epoch, id, transaction, checksum: 0 };
+        new.checksum = checksum(rest, &new);
+        label.copy_from_slice(bytemuck::bytes_of(&new));
+        state.bricks[id as usize] = transaction as u32;
+        if random.below(3) == 0 {
+            let value = displacement(transaction, id);
+            t.displacement_mut(id as u32).fill(value);
+            state.displacements[id as usize] = transaction as u32;
+        }
+    }
+    (state.transaction, state.epoch) = (transaction, epoch);
+    t.state_mut()[..size_of::<State>()].copy_from_slice(bytemuck::bytes_of(&state));
+}
+
+fn displacement(transaction: u64, id: u64) -> f32 {
+    ((transaction * 128 + id) % (1 << 23)) as f32
+}
+
+/// Looks at everything that a snapshot shows.
+pub fn check(snapshot: &Snapshot<'_>, rest: &impl BrickSource) -> Result<State, (Wrong, String)> {
+    let epoch = snapshot.epoch();
+    let state = State::of(snapshot.state());
+    if state.transaction != 0 && state.epoch != epoch {
+        return Err((Wrong::Mixed, format!("the state of epoch {} in a snapshot of epoch {epoch}", state.epoch)));
+    }
+    for id in 0..BRICKS {
+        let brick: &Brick = snapshot.brick(id as u32);
+        let written = u64::from(state.bricks[id]);
+        if written == 0 {
+            if !std::ptr::eq(brick, rest.brick(id as u32)) {
+                return Err((Wrong::Mixed, format!("epoch {epoch}: brick {id} has a version that its state does not know")));
+            }
+        } else {
+            let (label, bytes) = bytemuck::bytes_of(&brick.voxels).split_at(LABEL);
+            let label: Label = bytemuck::pod_read_unaligned(label);
+            if label.checksum != checksum(bytes, &label) || label.id != id as u64 {
+                return Err((Wrong::Torn, format!("epoch {epoch}: brick {id} of transaction {written} is torn")));
+            }
+            if label.transaction != written || label.epoch > epoch || label.epoch > snapshot.stamp(id as u32) {
+                let says = format!("brick {id} of transaction {} and epoch {}, not of {written}", label.transaction, label.epoch);
+                return Err((Wrong::Mixed, format!("epoch {epoch}: {says}")));
+            }
+        }
+        let moved: Option<&[f32; DISPLACEMENT_LEN]> = snapshot.displacement(id as u32);
+        let by = u64::from(state.displacements[id]);
+        match moved {
+            None if by == 0 => {}
+            Some(values) if by != 0 => {
+                let first = values[0];
+                if values.iter().any(|&v| v != first) {
+                    return Err((Wrong::Torn, format!("epoch {epoch}: the displacement of brick {id} is torn")));
+                }
+                if first != displacement(by, id as u64) {
+                    return Err((Wrong::Mixed, format!("epoch {epoch}: the displacement of brick {id} is not of transaction {by}")));
+                }
+            }
+            _ => return Err((Wrong::Mixed, format!("epoch {epoch}: brick {id} has a displacement, or none, against its state"))),
+        }
+    }
+    Ok(state)
+}
