@@ -8,10 +8,9 @@
 use crate::{
     brick::{DisplacementBrick, ELEMENTS},
     consistent::make_consistent,
-    propagate::{Before, Propagation},
+    propagate::{Before, Propagation, Scratch},
     region::{ChangedBrick, ChangedRegion},
     state::{Elements, limits_at},
-    tile::Tile,
     tissue::{Admission, Tissue, link_limit},
 };
 use maille_volume::{BrickId, BrickLayout, BrickSource, VolumeInfo, brick::EDGE};
@@ -47,7 +46,7 @@ pub struct PushOutcome {
     pub admitted: [f32; 3],
     /// mean over the pins of what was refused [mm, along the grid's axes]
     pub refused_mm: [f32; 3],
-    /// rounds of sweeps over bricks: a measure of the work
+    /// planes of bricks swept: a measure of the work (it depends on the number of threads, nothing else does)
     pub sweeps: u64,
 }
 
@@ -56,7 +55,7 @@ pub struct ChainMail {
     tissue: Tissue,
     elements: Elements,
     before: Before,
-    tile: Tile,
+    scratch: Scratch,
 }
 
 /// Longest motion of a pin [mm]; a longer one is cut to it, so that no arithmetic overflows. Far beyond any patient.
@@ -73,7 +72,7 @@ impl ChainMail {
     pub fn new(info: &VolumeInfo, tissue: Tissue) -> Self {
         assert_eq!(tissue.fault(), None, "tissue parameters are checked by the caller");
         let elements = Elements::new(BrickLayout::new(info.grid.size), info.grid.spacing.map(|s| s as f32));
-        Self { tissue, elements, before: Before::default(), tile: Tile::new() }
+        Self { tissue, elements, before: Before::default(), scratch: Scratch::new() }
     }
 
     /// Parameters of the tissue.
@@ -318,8 +317,8 @@ impl ChainMail {
     }
 
     fn propagation<'a, S: BrickSource + ?Sized>(&'a mut self, rest: &'a S, component: usize, sign: f32, slack: f32) -> Propagation<'a, S> {
-        let Self { tissue, elements, before, tile } = self;
-        Propagation { rest, tissue, elements, before, tile, component, sign, slack }
+        let Self { tissue, elements, before, scratch } = self;
+        Propagation { rest, tissue, elements, before, scratch, component, sign, slack }
     }
 
     /// What differs from the copies kept before, and how many elements that are.
@@ -329,8 +328,7 @@ impl ChainMail {
         let (mut region, mut moved) = (ChangedRegion::default(), 0);
         for (id, slot) in touched {
             let (before, now) = (self.before.of(slot), &self.elements.brick(slot).displacement.u);
-            let differs = |n: usize| (0..3).any(|c| before[c].is_some_and(|b| b[n].to_bits() != now[c][n].to_bits()));
-            let (changed, count) = spans(id, differs);
+            let (changed, count) = differences(id, before, now);
             if count > 0 {
                 region.bricks.push(changed);
                 moved += count;
@@ -348,6 +346,27 @@ pub(crate) fn spans(id: BrickId, changed: impl Fn(usize) -> bool) -> (ChangedBri
         if changed(n) {
             out.extend(n / EDGE, n % EDGE, n % EDGE + 1);
             count += 1;
+        }
+    }
+    (out, count)
+}
+
+/// Row spans of the elements of a brick whose bits differ from a copy, and their number.
+fn differences(id: BrickId, before: [Option<&[f32; ELEMENTS]>; 3], now: &[[f32; ELEMENTS]; 3]) -> (ChangedBrick, u64) {
+    let (mut out, mut count) = (ChangedBrick::new(id), 0);
+    for row in 0..ELEMENTS / EDGE {
+        let mut bits = [0u32; EDGE];
+        for (before, now) in before.iter().zip(now).filter_map(|(b, n)| Some(((*b)?, n))) {
+            let (before, now) = (&before.as_chunks::<EDGE>().0[row], &now.as_chunks::<EDGE>().0[row]);
+            for i in 0..EDGE {
+                bits[i] |= before[i].to_bits() ^ now[i].to_bits();
+            }
+        }
+        if bits.iter().fold(0, |a, b| a | b) != 0 {
+            let differs = |&i: &usize| bits[i] != 0;
+            let (low, high) = ((0..EDGE).find(differs), (0..EDGE).rfind(differs));
+            out.extend(row, low.unwrap_or(0), high.unwrap_or(0) + 1);
+            count += (0..EDGE).filter(differs).count() as u64;
         }
     }
     (out, count)

@@ -1,15 +1,17 @@
 //! Propagation from brick to brick, in one component and one direction, with the states before kept for undoing.
 //!
-//! Bricks wait in a heap, ordered by the largest displacement that enters them, so that most are visited once or twice;
-//! the order changes the work, never the bits. A brick is loaded when something reaches it.
+//! Bricks wait in a heap, ordered by the largest displacement that enters them, so that most are visited once or twice. The
+//! first few of the heap are visited together, in parallel, where there is enough to do: each reads its neighbours as they were
+//! before. Order and company change the work, never the bits. A brick is loaded when something reaches it.
 
 use crate::{
     brick::ELEMENTS,
-    state::{Elements, LimitsBrick},
-    tile::{Sides, Tile},
+    state::Elements,
+    tile::{Outcome, Sides, Tile, Visited},
     tissue::Tissue,
 };
 use maille_volume::BrickSource;
+use rayon::prelude::*;
 use std::collections::BinaryHeap;
 
 /// Key of the bricks from which a propagation starts; above every displacement's.
@@ -72,13 +74,43 @@ impl Before {
     }
 }
 
+/// Bricks visited together, at most: their tiles should stay in cache.
+const BATCH: usize = 8;
+/// Visits before other threads are woken, which costs as much as a few visits.
+const ALONE: usize = 16;
+
+/// Working memory of a propagation.
+pub struct Scratch {
+    tiles: Vec<Tile>,
+    waiting: BinaryHeap<(u32, usize)>,
+    is_waiting: Vec<bool>,
+}
+
+impl Scratch {
+    pub fn new() -> Self {
+        Self { tiles: (0..BATCH).map(|_| Tile::new()).collect(), waiting: BinaryHeap::new(), is_waiting: Vec::new() }
+    }
+}
+
+/// A brick of a batch: slot, where along each axis something enters, and whether it was set from outside.
+type Due = (usize, [u16; 3], bool);
+
+/// What a propagation did so far.
+#[derive(Default)]
+struct Done {
+    /// bricks in which a bound refused
+    refused: Vec<usize>,
+    /// planes swept
+    planes: u64,
+}
+
 /// One propagation: raises sign·u of a component from what was set.
 pub struct Propagation<'a, S: BrickSource + ?Sized> {
     pub rest: &'a S,
     pub tissue: &'a Tissue,
     pub elements: &'a mut Elements,
     pub before: &'a mut Before,
-    pub tile: &'a mut Tile,
+    pub scratch: &'a mut Scratch,
     pub component: usize,
     /// +1 raises, −1 lowers
     pub sign: f32,
@@ -88,60 +120,103 @@ pub struct Propagation<'a, S: BrickSource + ?Sized> {
 
 impl<S: BrickSource + ?Sized> Propagation<'_, S> {
     /// Propagates from bricks whose elements were set, until every link holds that no bound refuses. Gives back the bricks in
-    /// which a bound refused (empty where the seeds were admissible) and the number of sweeps.
+    /// which a bound refused (empty where the seeds were admissible) and the number of planes swept.
     pub fn run(&mut self, seeds: impl IntoIterator<Item = usize>) -> (Vec<usize>, u64) {
-        let (mut refused, mut sweeps) = (Vec::new(), 0);
-        let mut waiting: BinaryHeap<(u32, usize)> = BinaryHeap::new();
-        let mut is_waiting = vec![false; self.elements.bricks().len()];
+        self.scratch.is_waiting.clear();
+        self.scratch.is_waiting.resize(self.elements.bricks().len(), false);
         for slot in seeds {
-            if !std::mem::replace(&mut is_waiting[slot], true) {
-                waiting.push((SEED, slot));
+            if !std::mem::replace(&mut self.scratch.is_waiting[slot], true) {
+                self.scratch.waiting.push((SEED, slot));
             }
         }
-        while let Some((entering, slot)) = waiting.pop() {
-            if !std::mem::replace(&mut is_waiting[slot], false) {
+        let mut done = Done::default();
+        self.visit(1, ALONE, &mut done);
+        let threads = rayon::current_num_threads();
+        if threads > 1 && !self.scratch.waiting.is_empty() {
+            // one step into the pool for all batches, and not one for each
+            rayon::scope(|_| self.visit((2 * threads).min(BATCH), usize::MAX, &mut done));
+        } else {
+            self.visit(1, usize::MAX, &mut done);
+        }
+        done.refused.sort_unstable();
+        done.refused.dedup();
+        (done.refused, done.planes)
+    }
+
+    /// Visits bricks, `batch` at a time, until none waits or `visits` of them were made.
+    fn visit(&mut self, batch: usize, visits: usize, done: &mut Done) {
+        let mut due: Vec<Due> = Vec::with_capacity(batch);
+        let mut visited = 0;
+        while visited < visits {
+            self.next_batch(&mut due, batch);
+            if due.is_empty() {
+                break;
+            }
+            visited += due.len();
+            let (elements, component, sign, slack) = (&*self.elements, self.component, self.sign, self.slack);
+            let visit = |(tile, &(slot, entered, first)): (&mut Tile, &Due)| {
+                let brick = elements.brick(slot);
+                let (u, sides) = (&brick.displacement.u[component], sides(elements, brick.id, component));
+                tile.visit(&Visited { sign, u, limits: elements.limits(slot), sides, spacing: elements.spacing(), slack, entered, first })
+            };
+            let tiles = &mut self.scratch.tiles[..due.len()];
+            let outcomes: Vec<Outcome> = if due.len() > 1 {
+                tiles.par_iter_mut().zip(&due).map(visit).collect()
+            } else {
+                tiles.iter_mut().zip(&due).map(visit).collect()
+            };
+            for (n, (outcome, &(slot, _, first))) in outcomes.iter().zip(&due).enumerate() {
+                done.planes += outcome.planes;
+                if outcome.refused {
+                    done.refused.push(slot);
+                }
+                if !outcome.changed && !first {
+                    continue;
+                }
+                let brick = self.elements.brick_mut(slot);
+                self.scratch.tiles[n].scatter(sign, &mut brick.displacement.u[component]);
+                let id = brick.id;
+                for (side, value) in outcome.outgoing.into_iter().enumerate() {
+                    let (Some(value), Some(neighbour)) = (value, self.elements.neighbour(id, side)) else { continue };
+                    let next = self.elements.load_with_limits(self.rest, self.tissue, neighbour);
+                    self.scratch.is_waiting.resize(self.elements.bricks().len(), false);
+                    // a brick waits under the best value it has; older entries are skipped when they come up
+                    self.scratch.is_waiting[next] = true;
+                    self.scratch.waiting.push((ordered(value), next));
+                }
+            }
+        }
+    }
+
+    /// Takes up to `count` bricks that something enters from the heap, and prepares them and their neighbours.
+    fn next_batch(&mut self, due: &mut Vec<Due>, count: usize) {
+        due.clear();
+        while due.len() < count {
+            let Some((entering, slot)) = self.scratch.waiting.pop() else { break };
+            if !std::mem::replace(&mut self.scratch.is_waiting[slot], false) {
                 continue;
             }
             let id = self.elements.brick(slot).id;
-            self.before.keep(self.elements, slot, self.component);
             for side in 0..6 {
                 // bricks that a restart put back have displacements but no limits yet
                 if let Some(loaded) = self.elements.neighbour(id, side).filter(|&n| self.elements.slot(n).is_some()) {
                     self.elements.load_with_limits(self.rest, self.tissue, loaded);
                 }
             }
-            let spacing = self.elements.spacing();
-            {
-                let elements = &*self.elements;
-                let sides = sides(elements, id, self.component);
-                let LimitsBrick { offset, bound, .. } = elements.limits(slot);
-                self.tile.gather(self.sign, &elements.brick(slot).displacement.u[self.component], offset, bound, &sides);
-            }
-            let rounds = self.tile.settle(spacing);
-            sweeps += rounds;
-            if self.elements.limits(slot).bounded && self.tile.refused(spacing, self.slack) {
-                refused.push(slot);
-            }
-            // a brick that its neighbours left as it was tells nobody: two elements held at their bounds on either side of a
-            // face would wake each other for ever
             let first = entering == SEED;
-            if rounds == 1 && !first {
-                continue;
-            }
-            let outgoing = self.tile.outgoing(&sides(self.elements, id, self.component), spacing, self.sign);
-            self.tile.scatter(self.sign, &mut self.elements.brick_mut(slot).displacement.u[self.component]);
-            for (side, value) in outgoing.into_iter().enumerate() {
-                let (Some(value), Some(neighbour)) = (value, self.elements.neighbour(id, side)) else { continue };
-                let next = self.elements.load_with_limits(self.rest, self.tissue, neighbour);
-                is_waiting.resize(self.elements.bricks().len(), false);
-                // a brick waits under the best value it has; older entries are skipped when they come up
-                is_waiting[next] = true;
-                waiting.push((ordered(value), next));
+            let (elements, u) = (&*self.elements, &self.elements.brick(slot).displacement.u[self.component]);
+            let sides = sides(elements, id, self.component);
+            let entered = if first {
+                [u16::MAX; 3]
+            } else {
+                Visited::entering(self.sign, u, &elements.limits(slot).offset, &sides, elements.spacing())
+            };
+            // what was true when the neighbour called may have been settled since
+            if entered != [0; 3] {
+                self.before.keep(self.elements, slot, self.component);
+                due.push((slot, entered, first));
             }
         }
-        refused.sort_unstable();
-        refused.dedup();
-        (refused, sweeps)
     }
 }
 

@@ -16,8 +16,8 @@ pub struct LimitsBrick {
     pub offset: [f32; ELEMENTS],
     /// bound on |u_c| [mm]: 0 on bone, the movement limit, and the link to the virtual elements at the border
     pub bound: [f32; ELEMENTS],
-    /// whether any bound is finite
-    pub bounded: bool,
+    /// smallest bound
+    pub least_bound: f32,
 }
 
 /// One brick of the mail.
@@ -159,7 +159,7 @@ pub fn limits_at(tissue: &Tissue, layout: &BrickLayout, spacing: [f32; 3], voxel
 }
 
 fn limits_of<S: BrickSource + ?Sized>(rest: &S, tissue: &Tissue, layout: &BrickLayout, spacing: [f32; 3], id: BrickId) -> Box<LimitsBrick> {
-    let mut out = Box::new(LimitsBrick { offset: [f32::INFINITY; ELEMENTS], bound: [f32::INFINITY; ELEMENTS], bounded: false });
+    let mut out = Box::new(LimitsBrick { offset: [f32::INFINITY; ELEMENTS], bound: [f32::INFINITY; ELEMENTS], least_bound: f32::INFINITY });
     let (first, brick, rescale) = (layout.first_voxel(id), rest.brick(id), rest.info().rescale);
     let size: [usize; 3] = std::array::from_fn(|c| EDGE.min(layout.size[c] - first[c]));
     for k in 0..size[2] {
@@ -169,7 +169,7 @@ fn limits_of<S: BrickSource + ?Sized>(rest: &S, tissue: &Tissue, layout: &BrickL
                 let hu = rescale.value(f64::from(brick.voxels[from + i]));
                 let (offset, bound) = limits_at(tissue, layout, spacing, [first[0] + i, first[1] + j, first[2] + k], hu);
                 (out.offset[to + i], out.bound[to + i]) = (offset, bound);
-                out.bounded |= bound < f32::INFINITY;
+                out.least_bound = out.least_bound.min(bound);
             }
         }
     }

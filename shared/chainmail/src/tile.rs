@@ -1,228 +1,461 @@
 //! Propagation inside one brick: axis sweeps over a tile with its neighbours' faces, to the fixed point.
 //!
-//! Raise v(q) to v(p) − w(p, q) for every link, bounded by the element's bound: along +i, −i, +j, −j, +k, −k, until a
-//! round changes nothing. Rounding is monotone, so the fixed point is the same bits in any order of sweeps. Lowering is
-//! raising −u. Sweeps along j and k run over whole rows and vectorise; along i sixteen rows advance together.
+//! Raise v(q) to v(p) − w(p, q) for every link, bounded by the element's bound: up and down along i, j and k in turn, until no
+//! axis has anything left to change. Rounding is monotone, so the fixed point is the same bits in any order of sweeps.
+//! Lowering is raising −u. Whole rows advance together; along i the planes are transposed for that.
+//!
+//! Two sweeps, up and down, leave nothing to do along their axis: what goes up and comes back has lost a link each way. So a
+//! plane is swept along an axis only where something entered along it, and again only if another axis changed it since.
 //!
 //! Missing links (void, beyond the volume, bricks not loaded) carry v = −∞ or w = ∞ and never raise anything.
 
-use crate::{brick::ELEMENTS, tissue::link_limit};
+use crate::{brick::ELEMENTS, state::LimitsBrick, tissue::link_limits};
 use maille_volume::brick::EDGE;
+use wide::f32x4;
 
-/// Edge of a tile: a brick and one neighbour on each side.
+/// Registers of a row.
+const LANES: usize = EDGE / 4;
+/// Elements that advance together: a row of the brick.
+type Row = [f32x4; LANES];
+/// All zero.
+const ROW: Row = [f32x4::ZERO; LANES];
+/// A square of rows.
+type Plane = [Row; EDGE];
+
+/// Rows along j or k: a brick and one neighbour on each side.
 const T: usize = EDGE + 2;
-const PLANE: usize = T * T;
+/// Links along an axis, those to both neighbours included.
+const LINKS: usize = EDGE + 1;
 
 /// Working memory of a sweep.
 pub struct Tile {
-    v: Box<[f32; PLANE * T]>,
-    o: Box<[f32; PLANE * T]>,
-    bound: Box<[f32; ELEMENTS]>,
+    /// sign·u of row (j, k), neighbours' faces along j and k around them
+    v: Box<[[Row; T]; T]>,
+    /// sign·u of the elements at i = −1 and i = EDGE; by k, lanes along j
+    ends: Box<[Plane; 2]>,
+    /// limits of the links along i from i − 1 to i, by k and i, lanes along j
+    wi: Box<[[Row; LINKS]; EDGE]>,
+    /// limits of the links from row j − 1 to row j, by k
+    wj: Box<[[Row; LINKS]; EDGE]>,
+    /// limits of the links from plane k − 1 to plane k, by k
+    wk: Box<[Plane; LINKS]>,
+    /// bounds of the rows, by k, and with lanes along j; right where `bounded`
+    bound: Box<[[Plane; 2]; EDGE]>,
+    /// whether a bound can matter to what is in the tile
+    bounded: bool,
+    /// offsets of the rows, and of the elements at the ends, as in `v` and `ends`
+    offsets: Box<[[Row; T]; T]>,
+    end_offsets: Box<[Plane; 2]>,
+}
+
+/// A brick to be settled.
+pub struct Visited<'a> {
+    /// +1 raises, −1 lowers
+    pub sign: f32,
+    /// displacements [mm] of the component
+    pub u: &'a [f32; ELEMENTS],
+    pub limits: &'a LimitsBrick,
+    pub sides: Sides<'a>,
+    /// [mm]
+    pub spacing: [f32; 3],
+    /// rounding that is no refusal [mm]
+    pub slack: f32,
+    /// where neighbours raise something along each axis, as in [`Visited::entering`]
+    pub entered: [u16; 3],
+    /// whether elements of the brick were set from outside
+    pub first: bool,
+}
+
+impl Visited<'_> {
+    /// Where a neighbour's face raises an element of the brick: along i and j one bit for each k, along k one for each j. Where none
+    /// does, a visit would change nothing.
+    pub fn entering(sign: f32, u: &[f32; ELEMENTS], offset: &[f32; ELEMENTS], sides: &Sides, spacing: [f32; 3]) -> [u16; 3] {
+        let sign = f32x4::splat(sign);
+        std::array::from_fn(|axis| {
+            let s = f32x4::splat(spacing[axis]);
+            let mut raised = 0;
+            for side in [2 * axis, 2 * axis + 1] {
+                let Some((outside, o)) = sides[side] else { continue };
+                let (here, there) = if side % 2 == 0 { (0, EDGE - 1) } else { (EDGE - 1, 0) };
+                for at in 0..EDGE {
+                    let mut raises = f32x4::ZERO;
+                    for lane in 0..LANES {
+                        // four elements of the face in the plane at `x` along the axis
+                        let four = |plane: &[f32; ELEMENTS], x: usize| match axis {
+                            0 => column(plane, x, (at * EDGE + 4 * lane) * EDGE),
+                            1 => row(plane, x, at)[lane],
+                            _ => row(plane, at, x)[lane],
+                        };
+                        let w = link_limits(four(offset, here), four(o, there), s);
+                        raises |= (sign * four(outside, there) - w).simd_gt(sign * four(u, here));
+                    }
+                    raised |= u16::from(raises.any()) << at;
+                }
+            }
+            raised
+        })
+    }
+}
+
+/// What settling a brick did.
+pub struct Outcome {
+    /// whether anything was raised
+    pub changed: bool,
+    /// planes swept
+    pub planes: u64,
+    /// whether a bound refused part of the push
+    pub refused: bool,
+    /// for each side the largest value on the face that may raise the neighbour's elements
+    pub outgoing: [Option<f32>; 6],
 }
 
 /// What surrounds a brick, per side: displacement and offset planes of the neighbour, if it is loaded.
 pub type Sides<'a> = [Option<(&'a [f32; ELEMENTS], &'a [f32; ELEMENTS])>; 6];
 
 #[inline(always)]
-const fn at(i: usize, j: usize, k: usize) -> usize {
-    (k * T + j) * T + i
+fn row(plane: &[f32; ELEMENTS], j: usize, k: usize) -> Row {
+    let values: &[[f32; 4]; LANES] = plane.as_chunks().0[(k * EDGE + j) * LANES..].first_chunk().expect("a row of the plane");
+    values.map(f32x4::new)
 }
+
+/// Four elements at one i of the rows from `first` on.
+#[inline(always)]
+fn column(plane: &[f32; ELEMENTS], i: usize, first: usize) -> f32x4 {
+    let at = first + i;
+    f32x4::new([plane[at], plane[at + EDGE], plane[at + 2 * EDGE], plane[at + 3 * EDGE]])
+}
+
+#[inline(always)]
+fn transposed(plane: &[Row]) -> Plane {
+    let plane: &Plane = plane.first_chunk().expect("EDGE rows");
+    let mut out = [ROW; EDGE];
+    for j in 0..LANES {
+        for i in 0..LANES {
+            let block = f32x4::transpose([plane[4 * j][i], plane[4 * j + 1][i], plane[4 * j + 2][i], plane[4 * j + 3][i]]);
+            for n in 0..4 {
+                out[4 * i + n][j] = block[n];
+            }
+        }
+    }
+    out
+}
+
+#[inline(always)]
+fn limits(a: &Row, b: &Row, s: f32x4) -> Row {
+    [link_limits(a[0], b[0], s), link_limits(a[1], b[1], s), link_limits(a[2], b[2], s), link_limits(a[3], b[3], s)]
+}
+
+#[inline(always)]
+fn signed(sign: f32x4, u: Row) -> Row {
+    [sign * u[0], sign * u[1], sign * u[2], sign * u[3]]
+}
+
+/// Copies one row of a neighbour, or of what never raises anything.
+#[inline(always)]
+fn neighbour(v: &mut Row, o: &mut Row, sign: f32x4, side: Option<(&[f32; ELEMENTS], &[f32; ELEMENTS])>, j: usize, k: usize) {
+    (*v, *o) = match side {
+        Some((u, offset)) => (signed(sign, row(u, j, k)), row(offset, j, k)),
+        None => ([f32x4::splat(f32::NEG_INFINITY); LANES], ROW),
+    };
+}
+
+/// Raises `to` to from − w, at most to the bound, if there is one; notes in `changed` the lanes where that changed something.
+#[inline(always)]
+fn raise<const BOUNDED: bool>(to: &mut Row, from: &Row, w: &Row, bound: &Row, changed: &mut Row) {
+    for n in 0..LANES {
+        let mut candidate = from[n] - w[n];
+        if BOUNDED {
+            candidate = candidate.fast_min(bound[n]);
+        }
+        changed[n] |= candidate.simd_gt(to[n]);
+        to[n] = to[n].fast_max(candidate);
+    }
+}
+
+#[inline(always)]
+fn any(changed: &Row) -> bool {
+    ((changed[0] | changed[1]) | (changed[2] | changed[3])).any()
+}
+
+/// Numbers of the bits that are set, ascending.
+#[inline(always)]
+fn bits(mut set: u16) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let lowest = set.trailing_zeros() as usize;
+        set &= set.wrapping_sub(1);
+        (lowest < EDGE).then_some(lowest)
+    })
+}
+
+const _: () = assert!(LANES == 4, "rows of sixteen: other edges of bricks need other rows");
 
 impl Tile {
     pub fn new() -> Self {
-        Self { v: Box::new([0.0; PLANE * T]), o: Box::new([0.0; PLANE * T]), bound: Box::new([0.0; ELEMENTS]) }
+        let row = ROW;
+        Self {
+            v: Box::new([[row; T]; T]),
+            ends: Box::new([[row; EDGE]; 2]),
+            wi: Box::new([[row; LINKS]; EDGE]),
+            wj: Box::new([[row; LINKS]; EDGE]),
+            wk: Box::new([[row; EDGE]; LINKS]),
+            bound: Box::new([[[row; EDGE]; 2]; EDGE]),
+            bounded: false,
+            offsets: Box::new([[row; T]; T]),
+            end_offsets: Box::new([[row; EDGE]; 2]),
+        }
     }
 
-    /// Copies a brick's component, times `sign`, and the faces around it.
-    pub fn gather(&mut self, sign: f32, u: &[f32; ELEMENTS], o: &[f32; ELEMENTS], bound: &[f32; ELEMENTS], sides: &Sides) {
+    /// Settles one brick: gathers it, sweeps, and tells what must be told to the neighbours. [`Self::scatter`] puts it back.
+    pub fn visit(&mut self, brick: &Visited) -> Outcome {
+        self.gather(brick);
+        let (changed, planes) = if self.bounded { self.sweep::<true>(brick.entered) } else { self.sweep::<false>(brick.entered) };
+        let refused = self.bounded && self.refused(brick.slack);
+        // a brick that its neighbours left as it was tells nobody: two elements held at their bounds on either side of a face
+        // would wake each other for ever
+        let outgoing = if changed || brick.first { self.outgoing(&brick.sides) } else { [None; 6] };
+        Outcome { changed, planes, refused, outgoing }
+    }
+
+    /// Copies a brick's component, times `sign`, the faces around it, and what its links allow.
+    #[inline(always)]
+    fn gather(&mut self, brick: &Visited) {
+        let Visited { u, limits: limits_of, sides, .. } = *brick;
+        let (sign, spacing) = (f32x4::splat(brick.sign), brick.spacing.map(f32x4::splat));
         for k in 0..EDGE {
             for j in 0..EDGE {
-                let (from, to) = ((k * EDGE + j) * EDGE, at(1, j + 1, k + 1));
-                for (v, u) in self.v[to..to + EDGE].iter_mut().zip(&u[from..from + EDGE]) {
-                    *v = sign * u;
-                }
-                self.o[to..to + EDGE].copy_from_slice(&o[from..from + EDGE]);
+                self.v[k + 1][j + 1] = signed(sign, row(u, j, k));
+                self.offsets[k + 1][j + 1] = row(&limits_of.offset, j, k);
+            }
+            for (at, side, j) in [(0, 2, EDGE - 1), (T - 1, 3, 0)] {
+                neighbour(&mut self.v[k + 1][at], &mut self.offsets[k + 1][at], sign, sides[side], j, k);
             }
         }
-        *self.bound = *bound;
-        for (side, neighbour) in sides.iter().enumerate() {
-            for b in 0..EDGE {
-                for a in 0..EDGE {
-                    let (inside, tile) = face(side, a, b);
-                    (self.v[tile], self.o[tile]) = match neighbour {
-                        Some((u, o)) => (sign * u[inside], o[inside]),
-                        None => (f32::NEG_INFINITY, 0.0),
-                    };
-                }
+        for (at, side, k) in [(0, 4, EDGE - 1), (T - 1, 5, 0)] {
+            for j in 0..EDGE {
+                neighbour(&mut self.v[at][j + 1], &mut self.offsets[at][j + 1], sign, sides[side], j, k);
             }
         }
-    }
-
-    /// Sweeps to the fixed point; the number of rounds.
-    pub fn settle(&mut self, spacing: [f32; 3]) -> u64 {
-        let mut rounds = 0;
-        loop {
-            rounds += 1;
-            let mut changed = self.sweep_i(spacing[0]);
-            changed |= self.sweep_rows(T, EDGE, spacing[1]);
-            changed |= self.sweep_rows(PLANE, 1, spacing[2]);
-            if !changed {
-                return rounds;
+        for (end, i) in [(0, EDGE - 1), (1, 0)] {
+            let (v, o) = (&mut self.ends[end], &mut self.end_offsets[end]);
+            let Some((u, offset)) = sides[end] else {
+                (*v, *o) = ([[f32x4::splat(f32::NEG_INFINITY); LANES]; EDGE], [ROW; EDGE]);
+                continue;
+            };
+            for n in 0..EDGE * LANES {
+                let four = |plane| column(plane, i, n * 4 * EDGE);
+                (v[n / LANES][n % LANES], o[n / LANES][n % LANES]) = (sign * four(u), four(offset));
             }
         }
-    }
-
-    /// Both sweeps along i.
-    fn sweep_i(&mut self, s: f32) -> bool {
-        let mut changed = false;
         for k in 0..EDGE {
-            // one row at a time through all sixteen: independent chains hide the latency of max and subtraction
-            for i in 1..=EDGE {
+            for j in 0..LINKS {
+                self.wj[k][j] = limits(&self.offsets[k + 1][j], &self.offsets[k + 1][j + 1], spacing[1]);
+            }
+            let o = transposed(&self.offsets[k + 1][1..]);
+            self.wi[k][0] = limits(&self.end_offsets[0][k], &o[0], spacing[0]);
+            for i in 1..EDGE {
+                self.wi[k][i] = limits(&o[i - 1], &o[i], spacing[0]);
+            }
+            self.wi[k][EDGE] = limits(&o[EDGE - 1], &self.end_offsets[1][k], spacing[0]);
+        }
+        for k in 0..LINKS {
+            for j in 0..EDGE {
+                self.wk[k][j] = limits(&self.offsets[k][j + 1], &self.offsets[k + 1][j + 1], spacing[2]);
+            }
+        }
+        // nothing rises above the largest value that is there
+        self.bounded = self.largest() > limits_of.least_bound;
+        if self.bounded {
+            for k in 0..EDGE {
                 for j in 0..EDGE {
-                    let q = at(i, j + 1, k + 1);
-                    changed |= self.raise(q, q - 1, (k * EDGE + j) * EDGE + i - 1, s);
+                    self.bound[k][0][j] = row(&limits_of.bound, j, k);
+                }
+                self.bound[k][1] = transposed(&self.bound[k][0]);
+            }
+        }
+    }
+
+    /// Largest value in the tile.
+    #[inline(always)]
+    fn largest(&self) -> f32 {
+        // four at a time: one maximum waits for the one before it
+        let mut most = [f32x4::splat(f32::NEG_INFINITY); LANES];
+        for row in self.v.iter().flatten().chain(self.ends.iter().flatten()) {
+            for n in 0..LANES {
+                most[n] = most[n].fast_max(row[n]);
+            }
+        }
+        most.into_iter().flat_map(f32x4::to_array).fold(f32::NEG_INFINITY, f32::max)
+    }
+
+    /// Sweeps to the fixed point, first along the axes where something `entered`; whether anything changed, and the number of planes
+    /// swept.
+    #[inline(always)]
+    fn sweep<const BOUNDED: bool>(&mut self, entered: [u16; 3]) -> (bool, u64) {
+        let (mut due, mut changed, mut planes) = (entered, false, 0);
+        while due != [0; 3] {
+            for axis in [2, 1, 0] {
+                let now = std::mem::take(&mut due[axis]);
+                planes += u64::from(now.count_ones());
+                let again = match axis {
+                    0 => self.sweep_i::<BOUNDED>(now),
+                    1 => self.sweep_j::<BOUNDED>(now),
+                    _ => self.sweep_k::<BOUNDED>(now),
+                };
+                for other in 0..3 {
+                    due[other] |= again[other];
+                    changed |= again[other] != 0;
                 }
             }
-            for i in (1..=EDGE).rev() {
-                for j in 0..EDGE {
-                    let q = at(i, j + 1, k + 1);
-                    changed |= self.raise(q, q + 1, (k * EDGE + j) * EDGE + i - 1, s);
-                }
+        }
+        (changed, planes)
+    }
+
+    /// Sweeps planes k along i; what has to be swept again, by axis.
+    #[inline(always)]
+    fn sweep_i<const BOUNDED: bool>(&mut self, planes: u16) -> [u16; 3] {
+        let mut again = [0; 3];
+        for k in bits(planes) {
+            let mut v = transposed(&self.v[k + 1][1..]);
+            let (w, bound) = (&self.wi[k], &self.bound[k][1]);
+            let mut changed = ROW;
+            let mut from = self.ends[0][k];
+            for i in 0..EDGE {
+                raise::<BOUNDED>(&mut v[i], &from, &w[i], &bound[i], &mut changed);
+                from = v[i];
+            }
+            let mut from = self.ends[1][k];
+            for i in (0..EDGE).rev() {
+                raise::<BOUNDED>(&mut v[i], &from, &w[i + 1], &bound[i], &mut changed);
+                from = v[i];
+            }
+            // lanes run along j
+            let rows = (0..LANES).fold(0, |rows, n| rows | (changed[n].to_bitmask() as u16) << (4 * n));
+            if rows != 0 {
+                self.v[k + 1][1..=EDGE].copy_from_slice(&transposed(&v));
+                again[1] |= 1 << k;
+                again[2] |= rows;
             }
         }
-        changed
+        again
     }
 
-    /// Both sweeps along the axis whose neighbours lie `step` apart in the tile (T: along j, PLANE: along k).
-    fn sweep_rows(&mut self, step: usize, inner: usize, s: f32) -> bool {
-        let mut changed = false;
-        // rows in ascending order of the swept coordinate, whatever the other one
-        let row = |n: usize| {
-            let (swept, other) = (n / EDGE, n % EDGE);
-            if inner == EDGE { (swept, other) } else { (other, swept) }
-        };
-        for n in 0..EDGE * EDGE {
-            let (j, k) = row(n);
-            changed |= self.raise_row(j, k, step, false, s);
-        }
-        for n in (0..EDGE * EDGE).rev() {
-            let (j, k) = row(n);
-            changed |= self.raise_row(j, k, step, true, s);
-        }
-        changed
-    }
-
+    /// Sweeps planes k along j.
     #[inline(always)]
-    fn raise_row(&mut self, j: usize, k: usize, step: usize, upper: bool, s: f32) -> bool {
-        let q = at(1, j + 1, k + 1);
-        let p = if upper { q + step } else { q - step };
-        let source: [f32; EDGE] = self.v[p..p + EDGE].try_into().expect("EDGE values");
-        let op: [f32; EDGE] = self.o[p..p + EDGE].try_into().expect("EDGE values");
-        let oq: [f32; EDGE] = self.o[q..q + EDGE].try_into().expect("EDGE values");
-        let from = (k * EDGE + j) * EDGE;
-        let bound: &[f32; EDGE] = self.bound[from..from + EDGE].try_into().expect("EDGE values");
-        let target: &mut [f32; EDGE] = (&mut self.v[q..q + EDGE]).try_into().expect("EDGE values");
-        let mut changed = false;
-        for i in 0..EDGE {
-            let candidate = min(source[i] - link_limit(op[i], oq[i], s), bound[i]);
-            changed |= candidate > target[i];
-            target[i] = max(target[i], candidate);
+    fn sweep_j<const BOUNDED: bool>(&mut self, planes: u16) -> [u16; 3] {
+        let mut again = [0; 3];
+        for k in bits(planes) {
+            let (v, w, bound) = (&mut self.v[k + 1], &self.wj[k], &self.bound[k][0]);
+            let mut rows = 0;
+            let mut from = v[0];
+            for j in 0..EDGE {
+                let mut changed = ROW;
+                raise::<BOUNDED>(&mut v[j + 1], &from, &w[j], &bound[j], &mut changed);
+                from = v[j + 1];
+                rows |= u16::from(any(&changed)) << j;
+            }
+            let mut from = v[T - 1];
+            for j in (0..EDGE).rev() {
+                let mut changed = ROW;
+                raise::<BOUNDED>(&mut v[j + 1], &from, &w[j + 1], &bound[j], &mut changed);
+                from = v[j + 1];
+                rows |= u16::from(any(&changed)) << j;
+            }
+            again[0] |= u16::from(rows != 0) << k;
+            again[2] |= rows;
         }
-        changed
+        again
     }
 
+    /// Sweeps planes j along k.
     #[inline(always)]
-    fn raise(&mut self, q: usize, p: usize, element: usize, s: f32) -> bool {
-        let candidate = min(self.v[p] - link_limit(self.o[p], self.o[q], s), self.bound[element]);
-        let changed = candidate > self.v[q];
-        self.v[q] = max(self.v[q], candidate);
-        changed
+    fn sweep_k<const BOUNDED: bool>(&mut self, planes: u16) -> [u16; 3] {
+        let mut rows = 0;
+        for j in bits(planes) {
+            let mut from = self.v[0][j + 1];
+            for k in 0..EDGE {
+                let mut changed = ROW;
+                raise::<BOUNDED>(&mut self.v[k + 1][j + 1], &from, &self.wk[k][j], &self.bound[k][0][j], &mut changed);
+                from = self.v[k + 1][j + 1];
+                rows |= u16::from(any(&changed)) << k;
+            }
+            let mut from = self.v[T - 1][j + 1];
+            for k in (0..EDGE).rev() {
+                let mut changed = ROW;
+                raise::<BOUNDED>(&mut self.v[k + 1][j + 1], &from, &self.wk[k + 1][j], &self.bound[k][0][j], &mut changed);
+                from = self.v[k + 1][j + 1];
+                rows |= u16::from(any(&changed)) << k;
+            }
+        }
+        [rows, rows, 0]
     }
 
     /// Copies the component back.
     pub fn scatter(&self, sign: f32, u: &mut [f32; ELEMENTS]) {
-        for k in 0..EDGE {
-            for j in 0..EDGE {
-                let (to, from) = ((k * EDGE + j) * EDGE, at(1, j + 1, k + 1));
-                for (u, v) in u[to..to + EDGE].iter_mut().zip(&self.v[from..from + EDGE]) {
-                    // −0 would make two states that are equal differ in their bits
-                    *u = sign * v + 0.0;
-                }
-            }
+        let sign = f32x4::splat(sign);
+        for (n, out) in u.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+            let (row, lane) = (n / LANES, n % LANES);
+            // −0 would make two states that are equal differ in their bits
+            *out = (sign * self.v[row / EDGE + 1][row % EDGE + 1][lane] + f32x4::ZERO).to_array();
         }
     }
 
     /// Whether some element would be raised beyond its bound by a link (a bound that refuses part of the push). `slack`
     /// [mm]: rounding that is no refusal.
-    pub fn refused(&self, spacing: [f32; 3], slack: f32) -> bool {
-        let mut refused = false;
+    #[inline(always)]
+    fn refused(&self, slack: f32) -> bool {
+        let (mut over, slack) = (f32x4::ZERO, f32x4::splat(slack));
+        let mut test = |from: &Row, w: &Row, bound: &Row| {
+            for n in 0..LANES {
+                over |= (from[n] - w[n]).simd_gt(bound[n] + slack);
+            }
+        };
         for k in 0..EDGE {
-            for j in 0..EDGE {
-                for i in 0..EDGE {
-                    let (q, bound) = (at(i + 1, j + 1, k + 1), self.bound[(k * EDGE + j) * EDGE + i]);
-                    if bound == f32::INFINITY {
-                        continue;
-                    }
-                    for (step, s) in [(1, spacing[0]), (T, spacing[1]), (PLANE, spacing[2])] {
-                        for p in [q - step, q + step] {
-                            refused |= self.v[p] - link_limit(self.o[p], self.o[q], s) > bound + slack;
-                        }
-                    }
-                }
+            let [rows, columns] = &self.bound[k];
+            for (j, bound) in rows.iter().enumerate() {
+                test(&self.v[k + 1][j], &self.wj[k][j], bound);
+                test(&self.v[k + 1][j + 2], &self.wj[k][j + 1], bound);
+                test(&self.v[k][j + 1], &self.wk[k][j], bound);
+                test(&self.v[k + 2][j + 1], &self.wk[k + 1][j], bound);
+            }
+            let v = transposed(&self.v[k + 1][1..]);
+            for i in 0..EDGE {
+                test(if i > 0 { &v[i - 1] } else { &self.ends[0][k] }, &self.wi[k][i], &columns[i]);
+                test(if i + 1 < EDGE { &v[i + 1] } else { &self.ends[1][k] }, &self.wi[k][i + 1], &columns[i]);
             }
         }
-        refused
+        over.any()
     }
 
-    /// For each side: the largest v on the face that may raise the neighbour's elements, given its planes if loaded.
-    pub fn outgoing(&self, sides: &Sides, spacing: [f32; 3], sign: f32) -> [Option<f32>; 6] {
+    /// For each side: the largest v on the face that may raise the neighbour's elements. A neighbour that is not loaded is at rest,
+    /// and at least this half of the link lies before it.
+    #[inline(always)]
+    fn outgoing(&self, sides: &Sides) -> [Option<f32>; 6] {
         std::array::from_fn(|side| {
-            let s = spacing[side / 2];
-            let mut largest: Option<f32> = None;
-            for b in 0..EDGE {
-                for a in 0..EDGE {
-                    let (there, tile) = face(side, a, b);
-                    let here = inner(side, tile);
-                    let v = self.v[here];
-                    let raises = match &sides[side] {
-                        Some((u, o)) => v - link_limit(self.o[here], o[there], s) > sign * u[there],
-                        // at rest, offset not known yet: at least this half of the link
-                        None => v - link_limit(self.o[here], 0.0, s) > 0.0,
-                    };
-                    if raises {
-                        largest = Some(largest.map_or(v, |l| l.max(v)));
+            let lowest = f32x4::splat(f32::NEG_INFINITY);
+            let mut most = lowest;
+            let loaded = sides[side].is_some();
+            for n in 0..EDGE {
+                let column: Row;
+                let (here, w, there) = match side {
+                    0 | 1 => {
+                        let i = if side == 0 { 0 } else { EDGE - 1 };
+                        let at = |j: usize| self.v[n + 1][j + 1][i / 4].as_array()[i % 4];
+                        column = std::array::from_fn(|l| f32x4::new([at(4 * l), at(4 * l + 1), at(4 * l + 2), at(4 * l + 3)]));
+                        (&column, &self.wi[n][if side == 0 { 0 } else { EDGE }], &self.ends[side][n])
                     }
+                    2 => (&self.v[n + 1][1], &self.wj[n][0], &self.v[n + 1][0]),
+                    3 => (&self.v[n + 1][EDGE], &self.wj[n][EDGE], &self.v[n + 1][T - 1]),
+                    4 => (&self.v[1][n + 1], &self.wk[0][n], &self.v[0][n + 1]),
+                    _ => (&self.v[EDGE][n + 1], &self.wk[EDGE][n], &self.v[T - 1][n + 1]),
+                };
+                for lane in 0..LANES {
+                    let rest = if loaded { there[lane] } else { f32x4::ZERO };
+                    let raises = (here[lane] - w[lane]).simd_gt(rest);
+                    most = most.fast_max(raises.bitselect(here[lane], lowest));
                 }
             }
-            largest
+            let most = most.to_array().into_iter().fold(f32::NEG_INFINITY, f32::max);
+            (most > f32::NEG_INFINITY).then_some(most)
         })
     }
-}
-
-/// Element (a, b) of a side's face: offset in the neighbour's planes, and in the tile's apron.
-#[inline(always)]
-fn face(side: usize, a: usize, b: usize) -> (usize, usize) {
-    let (there, apron) = if side % 2 == 1 { (0, T - 1) } else { (EDGE - 1, 0) };
-    match side / 2 {
-        0 => ((b * EDGE + a) * EDGE + there, at(apron, a + 1, b + 1)),
-        1 => ((b * EDGE + there) * EDGE + a, at(a + 1, apron, b + 1)),
-        _ => ((there * EDGE + b) * EDGE + a, at(a + 1, b + 1, apron)),
-    }
-}
-
-/// The brick's own element behind an apron element.
-#[inline(always)]
-fn inner(side: usize, tile: usize) -> usize {
-    let step = [1, T, PLANE][side / 2];
-    if side % 2 == 1 { tile - step } else { tile + step }
-}
-
-// f32::max and f32::min treat NaN with care that costs instructions; there is none here
-#[inline(always)]
-fn max(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
-}
-#[inline(always)]
-fn min(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
 }

@@ -3,6 +3,8 @@
 //! v = clamp(HU + 1000, 0, 4095), softness = 1 − (v/4096)²; offset o = offset · softness, movement limit m = mc · softness.
 //! (Chapter 7 of the thesis prints the scaling reversed; 3.6.2 is right: dense tissue is stiff.)
 
+use wide::f32x4;
+
 /// How the admissible part of a push is chosen where bone, border or the movement limit refuse some of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Admission {
@@ -94,15 +96,28 @@ impl Tissue {
 }
 
 /// Limit [mm] of the link between neighbours with offsets `a` and `b` along an axis of spacing `s` [mm]; infinite where
-/// either is void: no link. One expression, used by propagation and by what is written to files.
+/// either is void: no link. Used by propagation and by what is written to files.
 #[inline(always)]
 pub fn link_limit(a: f32, b: f32, s: f32) -> f32 {
     0.5 * (a + b) * s
 }
 
+/// The same in four lanes, rounded in the same places: the same bits.
+#[inline(always)]
+pub fn link_limits(a: f32x4, b: f32x4, s: f32x4) -> f32x4 {
+    f32x4::splat(0.5) * (a + b) * s
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn limits_in_lanes_have_the_bits_of_single_ones() {
+        let (a, b) = ([0.2, 0.013, f32::INFINITY, 0.3333], [0.1999, 0.2, 0.1, 0.0]);
+        let lanes = link_limits(f32x4::new(a), f32x4::new(b), f32x4::splat(0.7)).to_array();
+        assert_eq!(lanes, std::array::from_fn(|n| link_limit(a[n], b[n], 0.7)));
+    }
 
     #[test]
     fn dense_tissue_is_stiff_and_air_is_soft() {
