@@ -24,7 +24,7 @@ use maille_store::{Reader, StoreSizes, fault};
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
 use tissue::{Random, State};
-use world::{Process, Tally, World};
+use world::{PATIENCE, Process, Tally, World};
 
 /// Reader processes.
 const READERS: usize = 8;
@@ -228,23 +228,25 @@ fn kill_at_points(rounds: u64, environment: &[(&str, &str)]) -> Tally {
     let mut siege = Siege::new(&world, &reader, seed, environment);
     let readers: Vec<Process> = (1..4).map(|n| world.read_at(n, seed + n as u64, &[])).collect();
     siege.kill_writer_after(Duration::from_millis(50));
+    // a protocol that is broken may never come to some point
+    let patience = if environment.is_empty() { PATIENCE } else { Duration::from_secs(2) };
     for _ in 0..rounds {
         for (_, point) in fault::Point::OF_WRITER {
             let passes = if point == "recovered" { 1 } else { 1 + random.below(60) };
             let at = format!("{point}:{passes}");
             let with_point: Vec<_> = environment.iter().copied().chain([("MAILLE_FAULT_POINT", at.as_str())]).collect();
-            let (said, died) = world.writer(seed, &with_point).dies();
+            let (said, died) = world.writer(seed, &with_point).dies(patience);
             siege.tally.writer_kills += 1;
             siege.missed(died, &at);
             siege.tally.take(&said, None);
             siege.judge(&said);
-            if siege.tally.faults() > 0 {
+            if siege.tally.faults() > 0 || (!died && !environment.is_empty()) {
                 return siege.end(readers);
             }
         }
         for (_, point) in fault::Point::OF_READER {
             let at = format!("{point}:{}", 1 + random.below(20));
-            let (said, died) = world.read_at(0, random.next(), &[("MAILLE_FAULT_POINT", &at)]).dies();
+            let (said, died) = world.read_at(0, random.next(), &[("MAILLE_FAULT_POINT", &at)]).dies(patience);
             siege.tally.reader_kills += 1;
             siege.missed(died, &at);
             siege.tally.take(&said, None);

@@ -17,7 +17,7 @@ use std::{
 };
 
 /// Long enough for anything on a machine that does a lot else.
-const PATIENCE: Duration = Duration::from_secs(60);
+pub const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A store and its domain.
 pub struct World {
@@ -118,8 +118,8 @@ impl Process {
     }
 
     /// Waits until it ends; what it said, and whether it died of SIGKILL.
-    pub fn dies(mut self) -> (Vec<Said>, bool) {
-        let deadline = Instant::now() + PATIENCE;
+    pub fn dies(mut self, patience: Duration) -> (Vec<Said>, bool) {
+        let deadline = Instant::now() + patience;
         loop {
             if let Some(status) = self.ended() {
                 return (self.all(), status.signal() == Some(Signal::KILL.as_raw()));

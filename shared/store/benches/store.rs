@@ -1,0 +1,98 @@
+//! The brick store's time: what a commit and a snapshot cost, in one process, warm.
+//!
+//! - `commit/N bricks`: from the entry of `commit()`, bricks already written, to its return; the transaction's filling is not counted.
+//! - `transaction/N bricks`: `begin()`, N private copies, `commit()`.
+//! - `snapshot`: pin and let go. The percentiles below are of single calls, the clock's own time taken off.
+//! - `recover`: opening as writer.
+//!
+//! `cargo bench -p maille-store` (the points of `fault` are compiled in, idle: a load each). The volume is 256³: 4 096 bricks with displacement; commits change voxels and displacement of each brick, and
+//! the state, as the deformation process does. Three readers' worth of room.
+
+use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
+use maille_contract::Role;
+use maille_store::{CommitOutcome, Reader, StoreKeeper, StoreSizes, Transaction, Writer};
+use maille_transport::{ControlMap, Domain, monotonic_ns};
+use maille_volume::{Grid, Rescale, Volume};
+use std::{hint::black_box, time::Duration};
+
+/// Bricks that one commit changes.
+const CHANGED: [u32; 3] = [1, 64, 512];
+
+fn change(t: &mut Transaction<'_>, bricks: u32, round: u32) {
+    for n in 0..bricks {
+        let id = (n * 7 + round) % 4096;
+        t.brick_mut(id).voxels[0] = round as i16;
+        t.displacement_mut(id)[0] = round as f32;
+    }
+    t.state_mut()[0] = round as u8;
+}
+
+fn percentiles(mut times: Vec<u64>) -> String {
+    times.sort_unstable();
+    let at = |p: f64| times[((times.len() - 1) as f64 * p) as usize];
+    format!("p50 {} p99 {} p99.9 {} max {} ns", at(0.5), at(0.99), at(0.999), at(1.0))
+}
+
+fn store(c: &mut Criterion) {
+    let grid = Grid::axis_aligned([256; 3], [1.0; 3]);
+    let volume = Volume::new(grid.clone(), Rescale { slope: 1.0, intercept: 0.0 }, vec![0; grid.voxel_count()]);
+    let domain = Domain::fresh().expect("/dev/shm");
+    let control = ControlMap::create(&domain).expect("a control block");
+    let keeper = StoreKeeper::create(&domain, &volume, StoreSizes::for_volume(4096, 512, 3, true), |_| {}).expect("a store");
+    let mut writer = Writer::open(&domain).expect("the store opens");
+    let reader = Reader::open(&domain, Role::Rendering).expect("the store opens");
+
+    let mut round = 0;
+    let mut group = c.benchmark_group("store");
+    group.measurement_time(Duration::from_secs(3));
+    for bricks in CHANGED {
+        let mut timed = |count: u64| {
+            let mut times = Vec::with_capacity(count as usize);
+            for _ in 0..count {
+                round += 1;
+                let mut t = writer.begin();
+                change(&mut t, bricks, round);
+                let began = monotonic_ns();
+                let outcome = t.commit();
+                times.push(monotonic_ns() - began);
+                assert!(matches!(outcome, CommitOutcome::Published { .. }), "{outcome:?}");
+            }
+            times
+        };
+        timed(50);
+        println!("commit of {bricks} bricks: {}", percentiles(timed(500)));
+        group.bench_function(format!("commit/{bricks} bricks"), |b| {
+            b.iter_custom(|count| Duration::from_nanos(timed(count).iter().sum()));
+        });
+        group.bench_function(format!("transaction/{bricks} bricks"), |b| {
+            b.iter(|| {
+                round += 1;
+                let mut t = writer.begin();
+                change(&mut t, bricks, round);
+                t.commit()
+            });
+        });
+    }
+    let clock = percentiles((0..100_000).map(|_| monotonic_ns()).map(|began| monotonic_ns() - began).collect());
+    println!("the clock alone: {clock}");
+    let single = |_| {
+        let began = monotonic_ns();
+        let snapshot = black_box(reader.snapshot());
+        let took = monotonic_ns() - began;
+        drop(snapshot);
+        took
+    };
+    println!("snapshot(), clock included: {}", percentiles((0..200_000).map(single).collect()));
+    group.bench_function("snapshot", |b| b.iter(|| black_box(reader.snapshot().epoch())));
+    drop(writer);
+    group.bench_function("recover", |b| {
+        b.iter_batched(|| (), |()| Writer::open(&domain).expect("the store opens"), BatchSize::PerIteration)
+    });
+    group.finish();
+    drop(reader);
+    drop((keeper, control));
+    domain.remove().expect("our own domain");
+}
+
+criterion_group!(benches, store);
+criterion_main!(benches);
