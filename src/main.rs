@@ -30,6 +30,9 @@ enum Command {
     Deform(commands::deform::Args),
     Render(commands::render::Args),
     Surface(commands::surface::Args),
+    Latency(commands::latency::Args),
+    #[command(hide = true)]
+    LatencyHelper(commands::latency::HelperArgs),
     Doctor(commands::doctor::Args),
     Clean(commands::clean::Args),
 }
@@ -45,6 +48,8 @@ fn main() -> ExitCode {
         Command::Deform(args) => commands::deform::run(&args),
         Command::Render(args) => commands::render::run(&args),
         Command::Surface(args) => commands::surface::run(&args),
+        Command::Latency(args) => commands::latency::run(&args),
+        Command::LatencyHelper(args) => commands::latency::help(&args),
         Command::Doctor(args) => commands::doctor::run(&args),
         Command::Clean(args) => commands::clean::run(&args),
     };

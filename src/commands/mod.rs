@@ -10,6 +10,7 @@ pub mod deform;
 pub mod doctor;
 pub mod import;
 pub mod info;
+pub mod latency;
 pub mod render;
 pub mod run;
 pub mod service;

@@ -17,6 +17,7 @@ pub mod histogram;
 pub mod index;
 pub mod messages;
 pub mod names;
+pub mod probe;
 
 pub use control::{ControlBlock, RunState, ServiceCell, ServiceState};
 pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, ViewState};

@@ -78,6 +78,18 @@ pub mod topic {
     pub const TOOL_COMMAND: &str = "maille/tool-command/v1";
     /// pixels with [`FrameHeader`](crate::FrameHeader) as user header, rendering → console
     pub const FRAME: &str = "maille/frame/v1";
+    /// [`Ping`](crate::probe::Ping), only in a domain of `maille latency`
+    pub const PING: &str = "maille/ping/v1";
+    /// [`Pong`](crate::probe::Pong), only in a domain of `maille latency`
+    pub const PONG: &str = "maille/pong/v1";
+}
+
+/// Events that wake a listener, inside a domain.
+pub mod event {
+    /// wakes the peer of who measures, only in a domain of `maille latency`
+    pub const ASKED: &str = "maille/asked/v1";
+    /// wakes who measures, only in a domain of `maille latency`
+    pub const ANSWERED: &str = "maille/answered/v1";
 }
 
 /// Segments of a domain; the name in /dev/shm is the domain's, an underscore, and this.

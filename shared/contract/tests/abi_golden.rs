@@ -7,6 +7,7 @@ use maille_contract::{
     Commit, ControlBlock, FrameHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState,
     index::{ChannelLayout, IndexHeader, IndexLayout, SlotRecord},
     messages::ViewRect,
+    probe::{Ping, Pong},
 };
 use std::mem::{align_of, offset_of, size_of};
 
@@ -40,6 +41,8 @@ fn messages_keep_their_names_sizes_and_offsets() {
     message!(ToolCommand, "maille.ToolCommand/v1", 64, stamp: 0, taken: 24, target_mm: 32, sent_ns: 56);
     message!(ViewRect, "maille.ViewRect/v1", 16, offset: 0, width: 8, height: 12);
     message!(FrameHeader, "maille.FrameHeader/v1", 112, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, views: 48);
+    message!(Ping, "maille.Ping/v1", 256, time_ns: 0, sequence: 8, rest: 16);
+    message!(Pong, "maille.Pong/v1", 256, time_ns: 0, sequence: 8, rest: 16);
 }
 
 #[test]

@@ -16,4 +16,4 @@ pub mod schedule;
 pub use allocation::{CountingAllocator, allocations, assert_steady, guard_installed, steady};
 pub use clock::monotonic_ns;
 pub use period::{Period, Tick};
-pub use schedule::{Notice, enter_realtime, lock_memory, prefault_stack};
+pub use schedule::{Notice, allowed_cpus, enter_realtime, lock_memory, pin_to_cpu, prefault_stack};

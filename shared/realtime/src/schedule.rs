@@ -46,6 +46,24 @@ pub fn enter_realtime(priority: i32, cpu: Option<usize>) -> Vec<Notice> {
     notices
 }
 
+/// CPUs that the calling thread may run on, in order.
+pub fn allowed_cpus() -> Vec<usize> {
+    // SAFETY: cpu_set_t is plain bits; all zeros is the empty set.
+    let mut set: libc::cpu_set_t = unsafe { std::mem::zeroed() };
+    // SAFETY: the set is valid for the size given and outlives the call; 0 is the calling thread.
+    let status = unsafe { libc::sched_getaffinity(0, size_of::<libc::cpu_set_t>(), &mut set) };
+    if status < 0 {
+        return Vec::new();
+    }
+    // SAFETY: every number asked for is below CPU_SETSIZE, so the bit lies inside the set.
+    (0..libc::CPU_SETSIZE as usize).filter(|&cpu| unsafe { libc::CPU_ISSET(cpu, &set) }).collect()
+}
+
+/// Keeps the calling thread on one CPU; its class and priority stay as they are.
+pub fn pin_to_cpu(cpu: usize) -> Option<Notice> {
+    pin(cpu).err().map(|error| Notice(format!("the thread could not be pinned to CPU {cpu}, it runs on any ({error})")))
+}
+
 /// Locks the pages of all present mappings in memory as they are touched. Returns a notice when that is refused.
 pub fn lock_memory() -> Option<Notice> {
     // SAFETY: mlockall takes flags only and changes no memory content.
@@ -101,6 +119,19 @@ fn checked(status: c_int) -> Result<(), std::io::Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_pinned_thread_may_run_on_that_cpu_only() {
+        let cpus = allowed_cpus();
+        std::thread::spawn(move || {
+            let last = *cpus.last().expect("a thread runs somewhere");
+            assert_eq!(pin_to_cpu(last), None);
+            assert_eq!(allowed_cpus(), [last]);
+            assert!(pin_to_cpu(usize::MAX).is_some());
+        })
+        .join()
+        .unwrap();
+    }
 
     /// Whatever the rights of who runs the tests, each refusal is told and nothing is fatal; a CPU that cannot exist is
     /// always refused.

@@ -14,14 +14,16 @@
 #![deny(unsafe_code)]
 
 pub mod domain;
+pub mod events;
 pub mod life;
 pub mod messages;
 pub mod segment;
 
 pub use domain::Domain;
+pub use events::{Event, Listener, Notifier};
 pub use life::Life;
 pub use maille_realtime::monotonic_ns;
-pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber};
+pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber, Topic};
 pub use segment::{Access, ControlMap, Segment};
 
 use std::path::PathBuf;

@@ -10,10 +10,14 @@ use iceoryx2::{
     service::port_factory::publish_subscribe::PortFactory,
 };
 use iceoryx2_bb_system_types::file_path::FilePath;
-use maille_contract::{Commit, FrameHeader, ToolCommand, ToolMove, ToolState, ViewState, names::topic};
+use maille_contract::{
+    Commit, FrameHeader, ToolCommand, ToolMove, ToolState, ViewState,
+    names::topic,
+    probe::{Ping, Pong},
+};
 use std::fmt::Debug;
 
-type Ice = ipc::Service;
+pub(crate) type Ice = ipc::Service;
 
 /// A message type with its topic.
 pub trait Message: Pod + Debug + ZeroCopySend {
@@ -36,6 +40,12 @@ impl Message for ViewState {
 impl Message for ToolCommand {
     const TOPIC: &'static str = topic::TOOL_COMMAND;
 }
+impl Message for Ping {
+    const TOPIC: &'static str = topic::PING;
+}
+impl Message for Pong {
+    const TOPIC: &'static str = topic::PONG;
+}
 
 /// Samples a subscriber's queue holds; older ones are dropped.
 const QUEUE: usize = 16;
@@ -44,16 +54,16 @@ const BORROWED: usize = 2;
 /// Publishers a topic takes: a restarted process may overlap its predecessor, whose slot is freed by the supervisor.
 const PUBLISHERS: usize = 3;
 const SUBSCRIBERS: usize = 8;
-const NODES: usize = 24;
+pub(crate) const NODES: usize = 24;
 /// A restarted process tries for this long to open what its dead predecessor may still occupy.
 const OPEN_TRIES: u32 = 200;
 
-fn ice<T, E: Debug>(action: impl FnOnce() -> String, result: Result<T, E>) -> Result<T, TransportError> {
+pub(crate) fn ice<T, E: Debug>(action: impl FnOnce() -> String, result: Result<T, E>) -> Result<T, TransportError> {
     result.map_err(|e| TransportError::Iceoryx { action: action(), reason: format!("{e:?}") })
 }
 
 /// Tries again while the slots of a dead process are being freed.
-fn retry<T, E: Debug>(action: &str, mut attempt: impl FnMut() -> Result<T, E>) -> Result<T, TransportError> {
+pub(crate) fn retry<T, E: Debug>(action: &str, mut attempt: impl FnMut() -> Result<T, E>) -> Result<T, TransportError> {
     let mut tries = 0;
     loop {
         match attempt() {
@@ -69,7 +79,7 @@ fn retry<T, E: Debug>(action: &str, mut attempt: impl FnMut() -> Result<T, E>) -
 
 /// A process's place in the domain. Ports stay on the thread that made them.
 pub struct Node {
-    node: IceNode<Ice>,
+    pub(crate) node: IceNode<Ice>,
 }
 
 /// The services of a domain, held open by the supervisor so that they outlive every other process.
@@ -80,6 +90,11 @@ pub struct Services {
     _view: PortFactory<Ice, ViewState, ()>,
     _command: PortFactory<Ice, ToolCommand, ()>,
     _frame: PortFactory<Ice, [u8], FrameHeader>,
+}
+
+/// One topic beside those of [`Services`], held open by whoever made it.
+pub struct Topic<T: Message> {
+    _service: PortFactory<Ice, T, ()>,
 }
 
 impl Node {
@@ -123,6 +138,14 @@ impl Node {
                 ice(|| format!("create the service {}", topic::FRAME), made)?
             },
         })
+    }
+
+    /// Makes one topic that no simulation has: for measurements. It lives while the returned value does.
+    ///
+    /// # Errors
+    /// When iceoryx2 refuses it.
+    pub fn create_topic<T: Message>(&self) -> Result<Topic<T>, TransportError> {
+        Ok(Topic { _service: self.create()? })
     }
 
     fn create<T: Message>(&self) -> Result<PortFactory<Ice, T, ()>, TransportError> {
@@ -209,7 +232,7 @@ impl Node {
 
 const FRAME_SUBSCRIBERS: usize = 2;
 
-fn service_name(topic: &str) -> Result<ServiceName, TransportError> {
+pub(crate) fn service_name(topic: &str) -> Result<ServiceName, TransportError> {
     ice(|| format!("name the service {topic}"), ServiceName::new(topic))
 }
 
