@@ -1,7 +1,8 @@
 //! A real run on a small scene, watched: `maille run` started by this process, its hand played by the observer.
 //!
 //! The run is headless, so that the observer can take the console's place: its pins, its command to the tool, its
-//! subscription to frames. What the services publish for everybody is all that it uses.
+//! subscription to frames. What the services publish for everybody is all that it uses. Should this process be killed, the
+//! run ends by itself half a minute after its start.
 
 use crate::{
     LatencyError, Report, Samples,
