@@ -72,7 +72,8 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             }
         }
         let now = monotonic_ns();
-        let due = now.saturating_sub(last_step) >= shortest_ns;
+        // while too much waits to become visible (a stopped reader holds the slots) the tissue stands; the newest move stays queued
+        let due = now.saturating_sub(last_step) >= shortest_ns && writer.has_room();
         let Some(message) = due.then(|| moves.latest()).flatten() else {
             if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && !touched(life.control()) {
                 let dt_s = (now - last_step).min(2 * RELAX_NS) as f64 * 1e-9;
