@@ -36,6 +36,7 @@ mod elements;
 mod intersection;
 mod mail;
 mod propagate;
+pub mod reference;
 mod region;
 mod relax;
 mod state;

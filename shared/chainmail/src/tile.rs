@@ -115,7 +115,7 @@ pub type Sides<'a> = [Option<(&'a [f32; ELEMENTS], &'a [f32; ELEMENTS])>; 6];
 #[inline(always)]
 fn row(plane: &[f32; ELEMENTS], j: usize, k: usize) -> Row {
     let values: &[[f32; 4]; LANES] = plane.as_chunks().0[(k * EDGE + j) * LANES..].first_chunk().expect("a row of the plane");
-    values.map(f32x4::new)
+    [f32x4::new(values[0]), f32x4::new(values[1]), f32x4::new(values[2]), f32x4::new(values[3])]
 }
 
 /// Four elements at one i of the rows from `first` on.

@@ -16,6 +16,7 @@ mod rows;
 mod sample;
 mod search;
 mod solve;
+pub mod tetrahedra;
 mod window;
 mod write;
 

@@ -63,14 +63,20 @@ impl Cover {
         (place != NONE).then_some(place as usize)
     }
 
+    /// Place of a brick, from now on one with voxels to be solved.
     #[inline]
-    fn place_mut(&mut self, id: BrickId) -> usize {
+    pub fn place_mut(&mut self, id: BrickId) -> usize {
         if self.place[id as usize] == NONE {
             self.place[id as usize] = self.ids.len() as u32;
             self.ids.push(id);
             self.spans.push([[0; 2]; ROWS]);
         }
         self.place[id as usize] as usize
+    }
+
+    /// Adds one voxel of the brick at a place.
+    pub fn extend(&mut self, place: usize, row: usize, i: usize) {
+        extend(&mut self.spans[place][row], [i as u8, i as u8 + 1]);
     }
 
     /// Number of voxels to be solved.
@@ -147,12 +153,19 @@ impl Cover {
             }
             (from[c], to[c]) = (low as usize, high as usize);
         }
-        for brick in from[0] / EDGE..=to[0] / EDGE {
-            let i = [(from[0].max(brick * EDGE) - brick * EDGE) as u8, (to[0].min(brick * EDGE + EDGE - 1) - brick * EDGE + 1) as u8];
-            for k in from[2]..=to[2] {
-                for j in from[1]..=to[1] {
-                    let place = self.place_mut(layout.id([brick, j / EDGE, k / EDGE]));
-                    extend(&mut self.spans[place][k % EDGE * EDGE + j % EDGE], i);
+        // brick by brick, so that each is looked up once
+        let part =
+            |c: usize, brick: usize| (from[c].max(brick * EDGE) - brick * EDGE)..(to[c].min(brick * EDGE + EDGE - 1) - brick * EDGE + 1);
+        for bk in from[2] / EDGE..=to[2] / EDGE {
+            for bj in from[1] / EDGE..=to[1] / EDGE {
+                for bi in from[0] / EDGE..=to[0] / EDGE {
+                    let place = self.place_mut(layout.id([bi, bj, bk]));
+                    let (spans, i) = (&mut self.spans[place], part(0, bi));
+                    for k in part(2, bk) {
+                        for j in part(1, bj) {
+                            extend(&mut spans[k * EDGE + j], [i.start as u8, i.end as u8]);
+                        }
+                    }
                 }
             }
         }
@@ -165,13 +178,15 @@ impl Cover {
 fn corner_boxes(window: &Window, first: [usize; 3], [from, j, k]: [isize; 3], to: isize, out: &mut [[f32x4; 2]; CORNERS]) {
     let (low, size) = (window.low(), window.size());
     let local = |c: usize, v: isize| (first[c] as isize + v - low[c] as isize).clamp(0, size[c] as isize - 1) as usize;
-    let rows = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dj, dk)| (window.row(local(1, j + dj), local(2, k + dk)), dj, dk));
+    let row = |dj: isize, dk: isize| (window.row(local(1, j + dj), local(2, k + dk)), f32x4::new([0.0, dj as f32, dk as f32, 0.0]));
+    let [(a, _), (b, at_b), (c, at_c), (d, at_d)] = [row(0, 0), row(1, 0), row(0, 1), row(1, 1)];
+    let mut first_corner = f32x4::new([from as f32, j as f32, k as f32, 0.0]);
     for i in from..=to {
         let x = local(0, i);
-        let at =
-            |(row, dj, dk): (&[[f32; 4]], isize, isize)| f32x4::new(row[x]) + f32x4::new([i as f32, (j + dj) as f32, (k + dk) as f32, 0.0]);
-        let [a, b, c, d] = rows.map(at);
-        out[(i + 1) as usize] = [a.fast_min(b).fast_min(c.fast_min(d)), a.fast_max(b).fast_max(c.fast_max(d))];
+        let (a, b, c, d) = (f32x4::new(a[x]), f32x4::new(b[x]) + at_b, f32x4::new(c[x]) + at_c, f32x4::new(d[x]) + at_d);
+        let (low, high) = (a.fast_min(b).fast_min(c.fast_min(d)), a.fast_max(b).fast_max(c.fast_max(d)));
+        out[(i + 1) as usize] = [low + first_corner, high + first_corner];
+        first_corner += f32x4::new([1.0, 0.0, 0.0, 0.0]);
     }
 }
 
