@@ -1,8 +1,8 @@
-//! SIGINT, SIGTERM and SIGHUP as a file descriptor to poll and a flag to ask.
+//! SIGINT, SIGTERM, SIGHUP and SIGQUIT as a file descriptor to poll and a flag to ask.
 //!
 //! A signal only writes a byte and sets a number; all that follows happens in the supervisor's loop.
 
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use std::{
     io::{self, Read as _},
     os::{
@@ -29,7 +29,7 @@ impl Signals {
         woken.set_nonblocking(true)?;
         let received = Arc::new(AtomicUsize::new(0));
         let mut registered = Vec::new();
-        for signal in [SIGINT, SIGTERM, SIGHUP] {
+        for signal in [SIGINT, SIGTERM, SIGHUP, SIGQUIT] {
             registered.push(signal_hook::flag::register_usize(signal, Arc::clone(&received), signal as usize)?);
             registered.push(signal_hook::low_level::pipe::register(signal, wake.try_clone()?)?);
         }
@@ -42,6 +42,7 @@ impl Signals {
             SIGINT => Some("SIGINT"),
             SIGTERM => Some("SIGTERM"),
             SIGHUP => Some("SIGHUP"),
+            SIGQUIT => Some("SIGQUIT"),
             _ => None,
         }
     }

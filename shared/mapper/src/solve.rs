@@ -48,6 +48,14 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         Self { rest, mail, inverter, void }
     }
 
+    /// Rest value of a voxel whose element did not move and is what is there now: all but voids, which tissue may have entered.
+    #[inline]
+    fn own_value(&self, [i, j, k]: [usize; 3]) -> Option<i16> {
+        let stored = self.rest.voxel(i, j, k);
+        let tissue = |t: f64| self.rest.info().rescale.value(f64::from(stored)) >= t;
+        self.mail.tissue().threshold_hu.is_none_or(tissue).then_some(stored)
+    }
+
     /// Solves the wanted voxels of a brick.
     pub fn brick(&self, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
         let mut report = MapReport::default();
@@ -57,6 +65,7 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         work.window.gather(self.mail, preimage_box(self.mail, voxels));
         let origin = work.window.low();
         let mut sampler = RestSampler::new(self.rest, origin, work.window.size());
+        let displacement = self.mail.displacement_brick(id);
         for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
             let range = span[0] as usize..span[1] as usize;
             report.voxels += range.len() as u64;
@@ -82,10 +91,17 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             let all = converged[range.clone()].iter().all(|&c| c) && self.mail.tissue().threshold_hu.is_none();
             for i in range {
                 let x = xyz(position[i]);
+                let voxel = [first[0] + i, first[1] + row % EDGE, first[2] + row / EDGE];
+                if at_rest(displacement, row * EDGE + i)
+                    && let Some(rest) = self.own_value(voxel)
+                {
+                    // X = x is the exact pre-image; the kernel stops within its tolerance of it
+                    out[i] = rest;
+                    continue;
+                }
                 let value = if all {
                     sampler.stored(x)
                 } else {
-                    let voxel = [first[0] + i, first[1] + row % EDGE, first[2] + row / EDGE];
                     let hard = Hard { solver: self, window: &work.window, voxel, target: xyz(target[i]) };
                     hard.value(&mut sampler, x, converged[i], &mut report)
                 };
@@ -95,6 +111,12 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         }
         report
     }
+}
+
+/// Whether an element did not move, bit for bit.
+#[inline]
+fn at_rest(displacement: Option<&DisplacementBrick>, element: usize) -> bool {
+    displacement.is_none_or(|d| d.u.iter().all(|plane| plane[element] == 0.0))
 }
 
 /// Moves the starts of a row to where the rows before it say.

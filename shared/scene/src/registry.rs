@@ -283,6 +283,17 @@ pub static KNOBS: &[Knob] = &[
         set: |s, v| s.rendering.opacity_end = v,
     },
     Knob {
+        name: "deformation.offset",
+        effect: "deformation",
+        summary: "link limit as a part of the link's length: how far a dent reaches",
+        defaults: [0.3, 0.2, 0.1],
+        error: "distance of displacements from those of elastic tissue under the same push [mm]",
+        truth: "a linear-elastic solution on the same grid",
+        cost: "step time, by the number of elements moved (inverse cube)",
+        get: |s| s.deformation.offset,
+        set: |s, v| s.deformation.offset = v,
+    },
+    Knob {
         name: "deformation.inversion_tolerance_mm",
         effect: "deformation",
         summary: "residual at which the mapper's inversion stops",

@@ -40,6 +40,18 @@ pub struct VolumeInfo {
     pub rescale: Rescale,
 }
 
+/// Steps of the quantised range that the middle 98 % of the values must span at least.
+const FEWEST_STEPS: f64 = 128.0;
+
+/// The 1st and 99th percentile of up to 100 000 finite values, evenly picked.
+fn middle(pixels: &Pixels) -> Option<[f64; 2]> {
+    let stride = (pixels.len() / 100_000).max(1);
+    let mut values: Vec<f64> = pixels.iter_f64().step_by(stride).filter(|v| v.is_finite()).collect();
+    values.sort_unstable_by(f64::total_cmp);
+    let at = |q: f64| values.get(((values.len().max(1) - 1) as f64 * q) as usize).copied();
+    Some([at(0.01)?, at(0.99)?])
+}
+
 /// A scalar volume in one flat array.
 #[derive(Clone, Debug)]
 pub struct Volume {
@@ -109,6 +121,12 @@ impl Volume {
                     return Ok(Self::new(image.grid.clone(), rescale, voxels));
                 }
                 let step = if max > min { (max - min) / 65_535.0 } else { 1.0 };
+                if let Some([low, high]) = middle(pixels).filter(|[low, high]| high > low && step > (high - low) / FEWEST_STEPS) {
+                    return Err(format!(
+                        "its values reach from {min:e} to {max:e}, but nearly all lie between {low:e} and {high:e}: in 16 bits those would be lost; \
+                         clip the outliers first"
+                    ));
+                }
                 let mut error = 0.0f64;
                 let voxels = pixels
                     .iter_f64()
@@ -146,5 +164,33 @@ impl Volume {
             };
         }
         image(Pixels::F32(self.voxels.iter().map(|&v| r.value(f64::from(v)) as f32).collect()), Rescale::IDENTITY)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(values: Vec<f64>) -> Image {
+        let grid = Grid::axis_aligned([values.len(), 1, 1], [1.0; 3]);
+        Image { grid, components: 1, frames: 1, rescale: Rescale::IDENTITY, pixels: Pixels::F64(values) }
+    }
+
+    #[test]
+    fn floats_are_quantised_within_the_error_that_is_told() {
+        let values: Vec<f64> = (0..1000).map(|n| (f64::from(n) * 0.37).sin() * 1500.0).collect();
+        let volume = Volume::from_image(&image(values.clone())).unwrap();
+        assert!(volume.quantisation_error < 0.03, "half a step of 3000/65535: {}", volume.quantisation_error);
+        for (n, v) in values.iter().enumerate() {
+            assert!((volume.value(n, 0, 0) - v).abs() <= volume.quantisation_error + 1e-9);
+        }
+    }
+
+    #[test]
+    fn one_huge_value_is_no_reason_to_lose_all_others() {
+        let mut values: Vec<f64> = (0..1000).map(|n| f64::from(n) - 500.5).collect();
+        values[3] = 1e30;
+        let error = Volume::from_image(&image(values)).unwrap_err();
+        assert!(error.contains("clip the outliers"), "{error}");
     }
 }

@@ -100,6 +100,12 @@ pub(crate) fn read(path: &Path) -> Parsed<Reading> {
     let layout = Layout { text, compressed, header_size, kind, big_endian };
     let data_file = need("ElementDataFile")?;
     let pixels = if matches!(data_file, "LOCAL" | "Local" | "local") {
+        if header_size > 0 {
+            return Err(Fault::unsupported(
+                "its voxels follow the header and it states a `HeaderSize` as well, which readers take in different ways",
+                "remove the `HeaderSize` line",
+            ));
+        }
         layout.read(&mut reader, expected, true)?
     } else {
         let files = data_files(path, data_file, &list)?;

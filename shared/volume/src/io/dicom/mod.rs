@@ -101,6 +101,12 @@ pub(crate) fn read_directory(path: &Path, wanted: Option<&str>) -> Result<Readin
         decode().map_err(|fault| Fault::Named(Box::new(fault.at(&object.path))))
     };
     let mut reading = stack::assemble(objects, &mut decode).map_err(|fault| fault.at(path))?;
+    // a damaged file may be the slice that is missing at an end, where nothing else would tell
+    if wanted.is_none()
+        && let Some(at) = unreadable.iter().position(|e| matches!(e, ReadError::Damaged { .. }))
+    {
+        return Err(unreadable.swap_remove(at));
+    }
     if !unreadable.is_empty() {
         reading.notices.push(Notice(format!(
             "{} other DICOM files in the directory are left out; the first: {}",

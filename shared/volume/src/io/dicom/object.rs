@@ -5,15 +5,17 @@
 
 use super::{
     super::error::{Fault, Parsed},
-    scan::{PixelBytes, PixelElement, Syntax, scan},
+    scan::{PixelBytes, PixelElement, Syntax, scan, without_unknown_sequences},
 };
 use crate::io::geometry::{SQUARE, cross, dot, norm};
 use dicom_object::{DefaultDicomObject, InMemDicomObject, OpenFileOptions, Tag, file::ReadPreamble};
 use std::{
+    cell::Cell,
     fs,
     io::Read,
-    panic::{AssertUnwindSafe, catch_unwind},
+    panic::{self, AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
+    sync::Once,
 };
 
 const DEFLATED: &str = "1.2.840.10008.1.2.1.99";
@@ -141,12 +143,33 @@ pub(super) fn data_set(path: &Path) -> Parsed<DataSet> {
         }
         .into();
     }
+    if let Some(known) = without_unknown_sequences(&bytes, syntax)? {
+        bytes = known;
+    }
     Ok(DataSet { bytes, syntax, transfer_syntax })
 }
 
-/// Runs a piece of the DICOM crates; a panic of theirs on hostile bytes becomes a fault here and takes nothing down.
+thread_local! {
+    /// a panic on this thread is being turned into a fault: it has nothing to say on standard error
+    static GUARDED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs a piece of the DICOM crates; a panic of theirs on hostile bytes becomes a fault here, says nothing, and takes nothing
+/// down. The program's own panic hook stays in charge of all other panics.
 pub(super) fn guarded<T>(what: &str, run: impl FnOnce() -> Parsed<T>) -> Parsed<T> {
-    catch_unwind(AssertUnwindSafe(run)).unwrap_or_else(|_| Err(Fault::damaged(format!("its {what} make no sense"))))
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let others = panic::take_hook();
+        panic::set_hook(Box::new(move |info| {
+            if !GUARDED.get() {
+                others(info)
+            }
+        }));
+    });
+    GUARDED.set(true);
+    let outcome = catch_unwind(AssertUnwindSafe(run));
+    GUARDED.set(false);
+    outcome.unwrap_or_else(|_| Err(Fault::damaged(format!("its {what} make no sense"))))
 }
 
 /// Hands a data set to `dicom-object` as a file with a meta group of our own, for those that came without one.

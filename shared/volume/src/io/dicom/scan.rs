@@ -70,9 +70,34 @@ pub(super) fn scan(bytes: &[u8], syntax: Syntax) -> Parsed<Option<PixelElement>>
             };
             return Ok(Some(PixelElement { element: element.tag.1, words: element.words, begin, end, data }));
         }
-        at = walk(bytes, &element, bytes.len(), syntax, 0)?;
+        at = walk(bytes, &element, bytes.len(), syntax, 0, &mut false)?;
     }
     Ok(None)
+}
+
+/// The data set without its elements that hold a sequence of unknown type (UN) and undefined length, or `None` when there is
+/// none. `dicom-object` reads what such a sequence holds by other rules than the standard's, so a length in it that this
+/// walk has checked is not the one that it would believe. No element that makes a volume is of that kind.
+pub(super) fn without_unknown_sequences(bytes: &[u8], syntax: Syntax) -> Parsed<Option<Vec<u8>>> {
+    let (mut at, mut kept, mut copied) = (0, Vec::new(), 0);
+    while bytes.len() - at >= 8 {
+        let element = header(bytes, at, syntax)?;
+        if element.tag.0 == 0x7FE0 {
+            break;
+        }
+        let mut found = false;
+        let next = walk(bytes, &element, bytes.len(), syntax, 0, &mut found)?;
+        if found {
+            kept.extend_from_slice(&bytes[copied..at]);
+            copied = next;
+        }
+        at = next;
+    }
+    if copied == 0 {
+        return Ok(None);
+    }
+    kept.extend_from_slice(&bytes[copied..]);
+    Ok(Some(kept))
 }
 
 fn u16_at(bytes: &[u8], at: usize, big: bool) -> Option<u16> {
@@ -137,14 +162,16 @@ fn value(bytes: &[u8], element: &Element, end: usize) -> Parsed<Range<usize>> {
     })
 }
 
-/// Passes over an element and all within it; returns where the next begins.
-fn walk(bytes: &[u8], element: &Element, end: usize, syntax: Syntax, depth: usize) -> Parsed<usize> {
+/// Passes over an element and all within it; returns where the next begins. `unknown` becomes true where a sequence of unknown
+/// type is met.
+fn walk(bytes: &[u8], element: &Element, end: usize, syntax: Syntax, depth: usize, unknown: &mut bool) -> Parsed<usize> {
     if depth > DEPTH {
         return Err(Fault::damaged(format!("its sequences are nested more than {DEPTH} deep")));
     }
     if element.length != UNDEFINED && !element.sequence {
         return value(bytes, element, end).map(|v| v.end);
     }
+    *unknown |= element.unknown;
     // An element of unknown type and undefined length is a sequence in implicit little endian. [PS3.5 6.2.2]
     let syntax = if element.unknown { Syntax { explicit: false, big_endian: false } } else { syntax };
     let sequence_end = if element.length == UNDEFINED { end } else { value(bytes, element, end)?.end };
@@ -161,7 +188,7 @@ fn walk(bytes: &[u8], element: &Element, end: usize, syntax: Syntax, depth: usiz
                 at = within.start;
                 while at < within.end {
                     let inner = header(bytes, at, syntax)?;
-                    at = walk(bytes, &inner, within.end, syntax, depth + 1)?;
+                    at = walk(bytes, &inner, within.end, syntax, depth + 1, unknown)?;
                 }
             }
             ITEM => {
@@ -172,7 +199,7 @@ fn walk(bytes: &[u8], element: &Element, end: usize, syntax: Syntax, depth: usiz
                         at = inner.value;
                         break;
                     }
-                    at = walk(bytes, &inner, sequence_end, syntax, depth + 1)?;
+                    at = walk(bytes, &inner, sequence_end, syntax, depth + 1, unknown)?;
                 }
             }
             tag => return Err(Fault::damaged(format!("a sequence holds ({:04X},{:04X}) where an item belongs", tag.0, tag.1))),
