@@ -59,6 +59,26 @@ impl<'w> Transaction<'w> {
         self.edit::<Brick>(0, id as usize)
     }
 
+    /// A brick as readers would see it if this were committed now.
+    ///
+    /// # Panics
+    /// When there is no such brick.
+    pub fn brick(&self, id: BrickId) -> &Brick {
+        let writer = &*self.writer;
+        assert!((id as usize) < writer.layout.count(), "brick {id} of {}", writer.layout.count());
+        let entry = writer.first[0] + id as usize;
+        let put_off = || writer.deferred.binary_search_by_key(&entry, |e| e.entry).ok().map(|n| &writer.deferred[n].version);
+        let version = match writer.place[entry] {
+            0 => put_off(),
+            n => Some(&self.edits[n as usize - 1].version),
+        };
+        bytemuck::from_bytes(match version {
+            Some(Version::Heap(words)) => &bytemuck::cast_slice(words)[..size_of::<Brick>()],
+            Some(Version::Slot(slot)) => writer.slot_bytes(0, *slot),
+            None => writer.slot_bytes(0, writer.published(entry)),
+        })
+    }
+
     /// A private new version of a brick's displacement; at first the current one, or zero.
     ///
     /// # Panics

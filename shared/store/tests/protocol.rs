@@ -70,6 +70,7 @@ fn a_snapshot_never_changes_and_a_dropped_transaction_leaves_no_trace() {
     transaction.brick_mut(3).voxels.fill(77);
     transaction.displacement_mut(3)[5] = 1.5;
     transaction.state_mut()[0] = 42;
+    assert_eq!((transaction.brick(3).voxels[9], transaction.brick(4).voxels), (77, before.brick(4).voxels));
     assert_eq!(transaction.commit(), CommitOutcome::Published { epoch: 2, entries: 3 });
     let after = reader.snapshot();
     assert_eq!((after.brick(3).voxels[9], after.displacement(3).unwrap()[5], after.state()[0], after.epoch()), (77, 1.5, 42, 2));
@@ -286,4 +287,20 @@ fn a_damaged_or_truncated_store_is_refused_with_a_sentence() {
     std::fs::OpenOptions::new().write(true).open(&index).unwrap().write_all_at(&[1; 8], 24).unwrap();
     let error = Reader::open(&world.domain, Role::Haptic).err().unwrap().to_string();
     assert!(error.contains("checksum"), "{error}");
+}
+
+#[test]
+fn segments_are_the_owners_alone_and_a_damaged_index_is_refused_not_followed() {
+    use std::os::unix::fs::{FileExt, PermissionsExt};
+    let world = World::new([32, 32, 32], sizes(4));
+    for segment in ["control", "index", "rest", "versions", "displacement", "state"] {
+        let path = std::path::Path::new("/dev/shm").join(world.domain.segment_name(segment));
+        assert_eq!(path.metadata().unwrap().permissions().mode() & 0o777, 0o600, "{segment}");
+    }
+    // the first root page, which names leaf pages, follows the header
+    let index = std::path::Path::new("/dev/shm").join(world.domain.segment_name("index"));
+    let root = size_of::<maille_contract::index::IndexHeader>().next_multiple_of(64) as u64;
+    std::fs::OpenOptions::new().write(true).open(&index).unwrap().write_all_at(&9999u32.to_ne_bytes(), root).unwrap();
+    let error = Writer::open(&world.domain).err().unwrap().to_string();
+    assert!(error.contains("leaf pages") && error.contains("there is none"), "{error}");
 }
