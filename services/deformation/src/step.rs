@@ -12,7 +12,7 @@ use maille_chainmail::{
 };
 use maille_contract::ToolMove;
 use maille_displacement::{along_axes, in_patient};
-use maille_mapper::{BrickSink, MapOptions, remap, rest_position};
+use maille_mapper::{BrickSink, MapOptions, Mapper, rest_position};
 use maille_scene::{Pins, Push, Scene};
 use maille_store::{CommitOutcome, Reader, Transaction, Writer};
 use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
@@ -30,6 +30,8 @@ pub(crate) struct Engine {
     pins: Pins,
     push_scale: f64,
     map: MapOptions,
+    /// keeps its memory from step to step
+    mapper: Mapper,
     /// time constant of relaxation [s], where the scene asks for it
     relaxation_s: Option<f64>,
 }
@@ -53,6 +55,10 @@ impl BrickSink for Sink<'_, '_> {
     fn edit(&mut self, id: BrickId) -> &mut Brick {
         self.0.brick_mut(id)
     }
+
+    fn current(&self, id: BrickId) -> Option<&Brick> {
+        Some(self.0.brick(id))
+    }
 }
 
 impl Engine {
@@ -73,7 +79,7 @@ impl Engine {
         let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: VOID_HU };
         let state = State { version: VERSION, threshold_hu: d.threshold_hu, last_move: 0, pushes: 0 };
         let relaxation_s = scene.has_effect("relaxation").then_some(d.relaxation_s);
-        Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, relaxation_s }
+        Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, mapper: Mapper::new(), relaxation_s }
     }
 
     /// Tissue begins at another value from now on.
@@ -116,9 +122,9 @@ impl Engine {
     }
 
     /// Maps what changed and commits voxels, displacements and state together.
-    fn commit(&self, region: &ChangedRegion, reader: &Reader, writer: &mut Writer) -> Done {
+    fn commit(&mut self, region: &ChangedRegion, reader: &Reader, writer: &mut Writer) -> Done {
         let mut transaction = writer.begin();
-        let mapped = remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
+        let mapped = self.mapper.remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
         self.commit_displacement(region, &mut transaction);
         self.state.write(transaction.state_mut());
         let bricks = mapped.bricks.len() as u64;
