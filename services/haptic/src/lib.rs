@@ -61,6 +61,7 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
         life.cell().count(Counter::NotRealtime, 1);
     }
     prefault_stack();
+    tick.resume(life.control());
     life.ready();
     let mut period = Period::new(scene.haptic.rate_hz);
     let mut leaving_since = None;

@@ -1,4 +1,7 @@
-//! Who holds the tool: the scene's script, a simulated hand, or the page; and how it passes from one to the other.
+//! Who holds the tool: the scene's script, a simulated hand, the page, or a device in another process; and how it passes from one to
+//! the other.
+//!
+//! A device in another process is never taken over by the page: there is a hand on it.
 //!
 //! The page takes the tool where it is and drags it through a critically damped follower; when it lets go (or falls silent
 //! for [`SILENT_NS`]), the script takes over from where the tool was left: the offset to the script's way is taken away
@@ -6,6 +9,7 @@
 
 use maille_contact::{ConsoleDevice, Device as _, DevicePose, Grip, SimulatedHand};
 use maille_contract::ToolCommand;
+use maille_contract::messages::{DEVICE_KNOWS_VELOCITY, DEVICE_VALID, DeviceState};
 use maille_scene::{Device, Hand, Tool, Waypoints};
 
 /// A page that holds the tool and has not been heard of for this long has let go [ns].
@@ -18,6 +22,8 @@ enum Holder {
     Script,
     /// a hand that follows the script and yields to the force
     Hand(Box<SimulatedHand>),
+    /// a device in another process
+    External,
 }
 
 /// Moves the tool.
@@ -37,8 +43,31 @@ impl Operator {
         let start = way.at(0.0);
         let pose = DevicePose { position_mm: start.position_mm, direction: start.direction, velocity_mm_s: None, valid: true };
         let hand = || Box::new(SimulatedHand::new(grip(&tool.hand), start.position_mm, start.direction));
-        let holder = if tool.device == Device::Sim { Holder::Hand(hand()) } else { Holder::Script };
+        let holder = match tool.device {
+            Device::Sim => Holder::Hand(hand()),
+            Device::External => Holder::External,
+            Device::Path | Device::PathFile(_) | Device::Console => Holder::Script,
+        };
         Self { way, holder, page: None, back: None, pose, follow_script: tool.device != Device::Console }
+    }
+
+    /// Whether a device in another process is held.
+    pub fn is_external(&self) -> bool {
+        matches!(self.holder, Holder::External)
+    }
+
+    /// What a device in another process says, and its age [s]. Invalid while it has said nothing.
+    pub fn external(&mut self, said: Option<DeviceState>, monotonic_ns: u64) -> (DevicePose, f64) {
+        let Some(said) = said.and_then(DeviceState::checked) else {
+            return (DevicePose { valid: false, ..self.pose }, 0.0);
+        };
+        self.pose = DevicePose {
+            position_mm: said.position_mm,
+            direction: said.direction,
+            velocity_mm_s: (said.flags & DEVICE_KNOWS_VELOCITY != 0).then_some(said.velocity_mm_s),
+            valid: said.flags & DEVICE_VALID != 0,
+        };
+        (self.pose, monotonic_ns.saturating_sub(said.measured_ns) as f64 * 1e-9)
     }
 
     /// Pose at a simulation time; `command` is the page's last word and `monotonic_ns` the clock that it was sent by.
@@ -87,7 +116,9 @@ impl Operator {
             }
         }
         match &mut self.holder {
-            Holder::Script => DevicePose { position_mm: target, direction: way.direction, velocity_mm_s: Some(velocity), valid: true },
+            Holder::Script | Holder::External => {
+                DevicePose { position_mm: target, direction: way.direction, velocity_mm_s: Some(velocity), valid: true }
+            }
             Holder::Hand(hand) => {
                 hand.set_target(target);
                 hand.read(now_ns)

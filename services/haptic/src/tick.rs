@@ -3,7 +3,7 @@
 use crate::{HapticError, operator::Operator, outbox::Outbox, setup};
 use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
-use maille_contract::messages::{TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER};
+use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER};
 use maille_contract::{ControlBlock, Role, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Scene};
 use maille_store::Reader;
@@ -61,21 +61,37 @@ impl<'a> Loop<'a> {
         })
     }
 
+    /// Goes on from where a haptic process that died left the tip, so that tissue which the tip is still in is felt from the wall it came
+    /// through and not taken for something to be freed from first. The force rises from zero all the same.
+    pub fn resume(&mut self, control: &ControlBlock) {
+        if let Some((last, _)) = control.tool.load::<ToolState>().filter(|(last, _)| last.flags & TOOL_IN_CONTACT != 0) {
+            self.core.resume(last.tip_mm, last.proxy_mm);
+        }
+    }
+
     /// One tick at `monotonic_ns`; `release` fades the force. Returns the force [N].
     pub fn run(&mut self, life: &Life, monotonic_ns: u64, release: bool) -> [f64; 3] {
         let control = life.control();
         let now_ns = control.time_ns(monotonic_ns);
         self.listen(control);
-        let pose = self.operator.read(now_ns, monotonic_ns, self.command.as_ref());
+        let (pose, pose_age_s) = if self.operator.is_external() {
+            self.operator.external(control.device.load().map(|(said, _)| said), monotonic_ns)
+        } else {
+            (self.operator.read(now_ns, monotonic_ns, self.command.as_ref()), 0.0)
+        };
         let snapshot = self.reader.snapshot();
         let surface = Isosurface::new(&snapshot, self.threshold_hu);
         let epoch = snapshot.epoch();
         // tissue stands as it was committed while its owner is silent: it is felt, and said
         self.degraded = monotonic_ns.saturating_sub(control.service(Role::Deformation).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
-        let inputs = TickInputs { now_ns, pose, pose_age_s: 0.0, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
+        let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
         let out = self.core.tick(&inputs);
         self.operator.write(out.force_n);
         self.ticks += 1;
+        if self.operator.is_external() {
+            let incarnation = life.incarnation();
+            control.device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence: self.ticks, incarnation, force_n: out.force_n });
+        }
         self.hand_over(control, now_ns, epoch, pose.direction, &out);
         self.last = Some(out);
         out.force_n

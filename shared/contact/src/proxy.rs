@@ -105,6 +105,13 @@ impl Proxy {
         *self = Self::new(self.radius_mm);
     }
 
+    /// As if the tip had been in air at `outside_mm` just now [mm]. Not finite: ignored.
+    pub fn resume(&mut self, outside_mm: [f64; 3]) {
+        if let Some(outside) = finite(outside_mm) {
+            (self.state, self.outside) = (State::Free, Some(outside));
+        }
+    }
+
     /// Height of a position over the last foot's tangent plane [mm], if there is a foot.
     pub fn height_over_foot_mm(&self, at: [f64; 3]) -> Option<f64> {
         match self.state {

@@ -243,6 +243,14 @@ impl HapticCore {
         self.passivity.energy_mj()
     }
 
+    /// Goes on with a contact that another core held: the tip's centre was last at `tip_mm`, held at `proxy_mm`, outside tissue. To be
+    /// called before the first tick; without it a tip that starts inside tissue is buried, and so it is when it starts more than a jump
+    /// away. The force rises from zero all the same.
+    pub fn resume(&mut self, tip_mm: [f64; 3], proxy_mm: [f64; 3]) {
+        self.position = finite(tip_mm);
+        self.proxy.resume(proxy_mm);
+    }
+
     /// One tick. Allocates nothing; bounded work.
     pub fn tick<S: Surface + ?Sized>(&mut self, inputs: &TickInputs<'_, S>) -> TickOutputs {
         let dt = self.step_time(inputs.now_ns);
@@ -274,7 +282,8 @@ impl HapticCore {
         }
         self.last_wanted = wanted;
         let wanted = if self.config.passivity && self.position.is_some() { self.passivity.control(x, wanted, dt) } else { wanted };
-        out.force_n = self.shaper.shape(wanted.into(), dt, fading);
+        // a late tick gets no larger a step: what the hand would feel is one tick's change
+        out.force_n = self.shaper.shape(wanted.into(), dt.min(self.config.period_s), fading);
         self.passivity.given(V3::from(out.force_n));
         out.fading = fading;
         out.faults = self.faults;

@@ -7,7 +7,7 @@ use crate::{
     cell::LatestCell,
     clock::SimulationClock,
     histogram::SharedHistogram,
-    messages::{ToolCommand, ToolState, ViewState},
+    messages::{DeviceForce, DeviceState, ToolCommand, ToolState, ViewState},
     names::PINS_PER_ROLE,
 };
 use bytemuck::Zeroable;
@@ -17,7 +17,7 @@ use core::sync::atomic::{
 };
 
 /// "maille" and the version of this layout.
-pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille01");
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille02");
 /// Pins in the block.
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
@@ -192,6 +192,10 @@ pub struct ControlBlock {
     pub view: LatestCell<{ words::<ViewState>() }>,
     /// last command to the tool. Writer: console
     pub command: LatestCell<{ words::<ToolCommand>() }>,
+    /// a device outside the haptic process: where it is. Writer: whoever drives it
+    pub device: LatestCell<{ words::<DeviceState>() }>,
+    /// a device outside the haptic process: what it shall render. Writer: haptic
+    pub device_force: LatestCell<{ words::<DeviceForce>() }>,
     /// one for each [`Role`](crate::Role)
     pub services: [ServiceCell; 4],
     /// pins of the store's readers; see [`Role::pins`](crate::Role::pins)

@@ -149,6 +149,46 @@ pub struct ToolCommand {
     pub sent_ns: u64,
 }
 
+/// What a device outside the haptic process says of itself, in a cell of the control block. Writer: whoever drives the device. Reader:
+/// haptic.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct DeviceState {
+    /// CLOCK_MONOTONIC [ns] at which the position was measured: the haptic process fades its force when this grows old
+    pub measured_ns: u64,
+    /// `DEVICE_…` bits
+    pub flags: u64,
+    /// centre of the tip [mm]
+    pub position_mm: [f64; 3],
+    /// where the tool points, unit
+    pub direction: [f64; 3],
+    /// velocity of the tip [mm/s], where [`DEVICE_KNOWS_VELOCITY`]
+    pub velocity_mm_s: [f64; 3],
+}
+
+/// In [`DeviceState::flags`]: the device vouches for what it says (plugged in, homed).
+pub const DEVICE_VALID: u64 = 1;
+/// In [`DeviceState::flags`]: the velocity is the device's own.
+pub const DEVICE_KNOWS_VELOCITY: u64 = 1 << 1;
+
+/// What a device outside the haptic process shall render, in a cell of the control block. Writer: haptic, every tick. Reader: whoever drives
+/// the device.
+///
+/// The device must let its force go when [`sent_ns`](Self::sent_ns) grows older than its watchdog allows: a haptic process that died or
+/// hangs says nothing more, and the last force would stay.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct DeviceForce {
+    /// CLOCK_MONOTONIC [ns] when it was written
+    pub sent_ns: u64,
+    /// ticks of this incarnation
+    pub sequence: u64,
+    /// which start of the haptic process wrote it
+    pub incarnation: u64,
+    /// force on the hand [N]
+    pub force_n: [f64; 3],
+}
+
 /// Views in a frame, in this order.
 pub const VIEWS: [&str; 4] = ["3d", "axial", "coronal", "sagittal"];
 
@@ -200,6 +240,14 @@ impl ToolCommand {
     /// The message, if its numbers can be used.
     pub fn checked(self) -> Option<Self> {
         (finite(&self.target_mm) && self.taken <= 1).then_some(self)
+    }
+}
+
+impl DeviceState {
+    /// The state, if its numbers can be used.
+    pub fn checked(self) -> Option<Self> {
+        let ok = [self.position_mm, self.direction, self.velocity_mm_s].iter().all(|v| finite(v)) && self.flags <= 3;
+        ok.then_some(self)
     }
 }
 

@@ -6,7 +6,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use maille_contract::{
     Commit, ControlBlock, FrameHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState,
     index::{ChannelLayout, IndexHeader, IndexLayout, SlotRecord},
-    messages::ViewRect,
+    messages::{DeviceForce, DeviceState, ViewRect},
     probe::{Ping, Pong},
 };
 use std::mem::{align_of, offset_of, size_of};
@@ -48,6 +48,8 @@ fn messages_keep_their_names_sizes_and_offsets() {
 #[test]
 fn shared_words_keep_their_sizes_and_offsets() {
     golden!(ServiceCell, 18_624, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 176, lateness: 9_400);
+    golden!(DeviceState, 88, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64);
+    golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
     assert_eq!((offset_of!(ControlBlock, magic), align_of::<ControlBlock>()), (0, 64));
     assert_eq!(offset_of!(ControlBlock, size_bytes), 8);
     assert_eq!(offset_of!(ControlBlock, pins) % 64, 0);

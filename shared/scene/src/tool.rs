@@ -31,10 +31,12 @@ pub enum Device {
     Sim,
     /// `"console"`: moved by dragging in the page; rests at the first way point until then
     Console,
+    /// `"external"`: a device driven by another process, through two cells of the control block; see `maille_contract::DeviceState`
+    External,
 }
 
 /// Devices that exist, for messages.
-pub const DEVICES: &[&str] = &["path", "sim", "console", "path:FILE"];
+pub const DEVICES: &[&str] = &["path", "sim", "console", "external", "path:FILE"];
 
 impl TryFrom<String> for Device {
     type Error = String;
@@ -44,6 +46,7 @@ impl TryFrom<String> for Device {
             "path" => Ok(Self::Path),
             "sim" => Ok(Self::Sim),
             "console" => Ok(Self::Console),
+            "external" => Ok(Self::External),
             "inverse3" => Err("the device `inverse3` is declared for later and not built yet; use `sim`, `path` or `console`".into()),
             _ => match text.strip_prefix("path:") {
                 Some("") => Err("`path:` wants a file name after the colon".into()),
@@ -61,6 +64,7 @@ impl From<Device> for String {
             Device::PathFile(file) => format!("path:{}", file.display()),
             Device::Sim => "sim".into(),
             Device::Console => "console".into(),
+            Device::External => "external".into(),
         }
     }
 }
