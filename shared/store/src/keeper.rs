@@ -55,6 +55,8 @@ impl StoreKeeper {
     /// When shared memory cannot be had; the error says how much is needed.
     pub fn create(domain: &Domain, volume: &Volume, sizes: StoreSizes, progress: impl Fn(f64) + Sync) -> Result<Self, StoreError> {
         let layout = index_layout(&volume.info, sizes);
+        #[cfg(feature = "fault-points")]
+        crate::raw::FaultMap::create(domain)?;
         let index = IndexMap::create(domain, layout)?;
         let bricks = BrickLayout::new(volume.info.grid.size);
         let mut keeper = Self {

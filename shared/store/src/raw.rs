@@ -208,3 +208,35 @@ impl<T: Pod> Slots<T> {
         })
     }
 }
+
+/// A word for each role, by which tests tell running services where to die.
+#[cfg(feature = "fault-points")]
+pub(crate) struct FaultMap(Segment);
+
+#[cfg(feature = "fault-points")]
+impl FaultMap {
+    const SEGMENT: &str = "fault";
+    const WORDS: usize = maille_contract::Role::ALL.len();
+
+    pub fn create(domain: &Domain) -> Result<Self, StoreError> {
+        Ok(Self(Segment::create(domain, Self::SEGMENT, Self::WORDS * size_of::<AtomicU64>())?))
+    }
+
+    pub fn open(domain: &Domain) -> Result<Self, StoreError> {
+        let segment = Segment::open(domain, Self::SEGMENT, Access::ReadWrite)?;
+        let expected = Self::WORDS * size_of::<AtomicU64>();
+        if segment.len() < expected {
+            return Err(StoreError::Size { segment: Self::SEGMENT, found: segment.len(), expected });
+        }
+        Ok(Self(segment))
+    }
+
+    #[inline(always)]
+    pub fn word(&self, role: maille_contract::Role) -> &AtomicU64 {
+        let offset = role as usize * size_of::<AtomicU64>();
+        // SAFETY: a role's number is below `WORDS`, which the mapping holds (checked or created so).
+        let word = unsafe { self.0.base().add(offset) };
+        // SAFETY: eight bytes of the mapping, aligned, mapped while `self` lives; atomics may be written by all at any time.
+        unsafe { word.cast::<AtomicU64>().as_ref() }
+    }
+}

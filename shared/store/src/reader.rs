@@ -47,6 +47,8 @@ impl Reader {
     /// # Errors
     /// When a segment is missing, truncated or of another version.
     pub fn open(domain: &Domain, role: Role) -> Result<Self, StoreError> {
+        #[cfg(feature = "fault-points")]
+        crate::fault::arm(domain, Some(role));
         Self::open_with_pins(domain, role.pins())
     }
 
@@ -61,7 +63,7 @@ impl Reader {
     pub fn open_with_pins(domain: &Domain, pins: Range<usize>) -> Result<Self, StoreError> {
         assert!(!pins.is_empty() && pins.end <= PINS, "pins {pins:?} of {PINS}");
         #[cfg(feature = "fault-points")]
-        crate::fault::arm();
+        crate::fault::arm(domain, None);
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::Read)?;
         let [voxels, displacement, state] = index.layout.channels;

@@ -68,7 +68,7 @@ impl Writer {
     /// When a segment is missing, truncated, damaged or of another version.
     pub fn open(domain: &Domain) -> Result<Self, StoreError> {
         #[cfg(feature = "fault-points")]
-        crate::fault::arm();
+        crate::fault::arm(domain, Some(maille_contract::Role::Deformation));
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::ReadWrite)?;
         let channels = index.layout.channels;

@@ -20,6 +20,7 @@ mod tissue;
 mod world;
 
 use child::Said;
+use maille_contract::Role;
 use maille_store::{Reader, StoreSizes, fault};
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
@@ -45,9 +46,10 @@ fn main() {
     if arguments.first().is_some_and(|a| a == "child") {
         child::main(&arguments[1..]);
     }
-    let cases: [(&str, fn()); 4] = [
+    let cases: [(&str, fn()); 5] = [
         ("nothing_is_torn_mixed_or_lost_by_kills_at_random_instants", random_instants),
         ("nothing_is_torn_mixed_or_lost_by_kills_at_named_points", named_points),
+        ("a_running_process_is_told_where_to_die", told_while_running),
         ("protocols_broken_on_purpose_are_caught", broken_protocols),
         ("a_stopped_reader_costs_neither_time_nor_memory", stopped_readers),
     ];
@@ -257,6 +259,34 @@ fn kill_at_points(rounds: u64, environment: &[(&str, &str)]) -> Tally {
     }
     siege.kill_writer_after(Duration::from_millis(50));
     siege.end(readers)
+}
+
+/// The way of tests of whole runs: each word is taken out by the process that obeys it, so that its successor lives.
+fn told_while_running() {
+    let world = World::new(tissue::SIZES);
+    let reader = world.reader();
+    let mut siege = Siege::new(&world, &reader, number("MAILLE_SEED", 1), &[]);
+    let faults = fault::Faults::open(&world.domain).expect("the keeper was built with fault points");
+    for (point, name) in [(fault::Point::LeafCopied, "leaf-copied"), (fault::Point::BeforeHead, "before-head")] {
+        let writer = world.writer(siege.seed, &[]);
+        writer.hears(0, |said| matches!(said, Said::Published(..)).then_some(()));
+        faults.arm(Role::Deformation, point, 5, fault::Action::Kill);
+        let (said, died) = writer.dies(PATIENCE);
+        assert!(died && !faults.is_armed(Role::Deformation), "nobody died at {name}");
+        siege.judge(&said);
+    }
+    let writer = world.writer(siege.seed, &[]);
+    writer.hears(0, |said| matches!(said, Said::Published(..)).then_some(()));
+    faults.arm(Role::Deformation, fault::Point::AfterHead, 1, fault::Action::Stop);
+    eventually_stopped(&writer);
+    let from = writer.words();
+    writer.signal(Signal::CONT);
+    writer.hears(from, |said| matches!(said, Said::Published(..)).then_some(()));
+    faults.arm(Role::Rendering, fault::Point::Pinned, 1, fault::Action::Kill);
+    assert!(faults.disarm(Role::Rendering), "another role's word is nobody's");
+    let (said, _) = writer.kill();
+    siege.judge(&said);
+    assert_eq!(siege.end(Vec::new()).faults(), 0);
 }
 
 fn broken_protocols() {
