@@ -1,8 +1,7 @@
 //! Many points of a row at once: the same fixed point and the same Newton as [`Inverter::invert`], one evaluation of every point
-//! after the other, so that the processor works on a dozen points while one waits for its corners.
+//! after the other, so that the processor works on a dozen points while one waits for its corners; then only the points that go on.
 //!
-//! The three components of a point travel in one register of four lanes (the fourth is 0). A row stops when its slowest point
-//! meets the rule. The fixed point gives back X′ = x − u(X), not the X it tested: if u contracts by q and |x − X − u(X)| = r, the
+//! The three components of a point travel in one register of four lanes (the fourth is 0). The fixed point gives back X′ = x − u(X), not the X it tested: if u contracts by q and |x − X − u(X)| = r, the
 //! error of X′ is at most q·r/(1 − q), so that r ≤ tolerance·(1 − q)/q is enough.
 //!
 //! Units: index units. Cost: one field evaluation a point and iteration. Not here: damping and searches; points that do not
@@ -55,25 +54,37 @@ impl Inverter {
         position: &mut [f32x4; N],
         converged: &mut [bool; N],
     ) -> u32 {
-        let stop = self.stop() / self.contraction;
-        let weight = weights(self.weight);
-        let mut residual = [f32x4::ZERO; N];
-        let mut evaluations = 0;
-        for _ in 0..ROW_ITERATIONS {
-            let mut worst = f32x4::ZERO;
-            for n in range.clone() {
-                let next = target[n] - field.value(position[n]);
-                residual[n] = (next - position[n]).abs() * weight;
-                worst = worst.fast_max(residual[n]);
-                position[n] = next;
-            }
-            evaluations += range.len() as u32;
-            if largest(worst) <= stop {
+        const { assert!(N <= 64, "open points are bits of a word") };
+        let (stop, weight) = (f32x4::splat(self.stop() / self.contraction), weights(self.weight));
+        let mut evaluations = range.len() as u32;
+        let mut open = 0u64;
+        // every point once, independent of one another; NaN fails the comparison and stays open
+        let step = |position: &mut f32x4, target: f32x4| {
+            let next = target - field.value(*position);
+            let residual = (next - *position).abs() * weight;
+            *position = next;
+            residual.simd_le(stop).to_bitmask() != 0b1111
+        };
+        for n in range.clone() {
+            open |= u64::from(step(&mut position[n], target[n])) << n;
+        }
+        // then only those that go on
+        for _ in 1..ROW_ITERATIONS {
+            if open == 0 {
                 break;
+            }
+            evaluations += open.count_ones();
+            let mut left = open;
+            while left != 0 {
+                let n = left.trailing_zeros() as usize;
+                left &= left - 1;
+                if !step(&mut position[n], target[n]) {
+                    open &= !(1 << n);
+                }
             }
         }
         for n in range {
-            converged[n] = largest(residual[n]) <= stop;
+            converged[n] = open >> n & 1 == 0;
         }
         evaluations
     }

@@ -2,7 +2,8 @@
 //!
 //! A cell whose corners kept their displacement maps as before, and the map is one-to-one; so the voxels whose pre-image
 //! changed lie in the images of the touched cells. Images of runs of cells are covered by the box of their displaced
-//! corners. Covering too much costs time, never correctness; the union is the same whoever collects it in whatever order.
+//! corners; where displacements are small the spans of the changed elements are dilated by their range instead, a brick at a
+//! time. Covering too much costs time, never correctness; the union is the same whoever collects it in whatever order.
 
 use crate::window::Window;
 use maille_chainmail::{ChainMail, ChangedBrick};
@@ -30,6 +31,11 @@ const CORNERS: usize = EDGE + 2;
 const SLACK: f32 = 1e-3;
 /// Beyond every displacement of a volume of less than 2³² voxels [voxels]: makes truncation a floor.
 const BIAS: f32 = 2048.0;
+
+/// Largest dilation of spans [voxels].
+const REACH: usize = 4;
+/// Rows of a brick and of its neighbours within reach.
+const WIDE: usize = EDGE + 2 * REACH;
 
 /// No entry.
 const NONE: u32 = u32::MAX;
@@ -99,6 +105,9 @@ impl Cover {
         let layout = *mail.layout();
         let Some((low, high)) = bounds(&changed.spans) else { return };
         let (first, last) = (layout.first_voxel(changed.id), layout.size.map(|s| s - 1));
+        if let Some(by) = dilation(mail, first, low, high) {
+            return self.add_dilated(&layout, changed, first, (low, high), by);
+        }
         // elements low − 1 … high + 1 are corners of the touched cells low − 1 … high
         window.gather(
             mail,
@@ -137,6 +146,62 @@ impl Cover {
         }
     }
 
+    /// Adds the spans of a changed brick, dilated on both sides of each axis by no more than [`REACH`].
+    fn add_dilated(
+        &mut self,
+        layout: &BrickLayout,
+        changed: &ChangedBrick,
+        first: [usize; 3],
+        (low, high): ([usize; 3], [usize; 3]),
+        by: [[isize; 2]; 3],
+    ) {
+        // ends of spans as planes, so that unions are lane-wise minima and maxima; empty: the ends are crossed
+        const EMPTY: [[i16; WIDE]; 2] = [[i16::MAX; WIDE], [i16::MIN; WIDE]];
+        let mut in_plane = [EMPTY; EDGE];
+        for k in low[2]..=high[2] {
+            let mut rows = EMPTY;
+            for j in low[1]..=high[1] {
+                let [a, b] = changed.spans[k * EDGE + j];
+                if b > 0 {
+                    (rows[0][j + REACH], rows[1][j + REACH]) = (i16::from(a) + by[0][0] as i16, i16::from(b) + by[0][1] as i16);
+                }
+            }
+            for shift in by[1][0]..=by[1][1] {
+                // row j goes to j + shift; what a shift carries round the end is empty: spans lie REACH inside
+                let mut moved = rows;
+                for plane in &mut moved {
+                    plane.rotate_right(shift.rem_euclid(WIDE as isize) as usize);
+                }
+                union(&mut in_plane[k], &moved);
+            }
+        }
+        let ends = |c: usize| low[c] as isize + by[c][0]..=high[c] as isize + by[c][1];
+        for z in ends(2) {
+            let voxel_k = first[2] as isize + z;
+            if voxel_k < 0 || voxel_k >= layout.size[2] as isize {
+                continue;
+            }
+            let mut rows = EMPTY;
+            for k in (z - by[2][1]).max(low[2] as isize)..=(z - by[2][0]).min(high[2] as isize) {
+                union(&mut rows, &in_plane[k as usize]);
+            }
+            for y in ends(1) {
+                let (voxel_j, at) = (first[1] as isize + y, (y + REACH as isize) as usize);
+                let a = (first[0] as isize + rows[0][at] as isize).max(0);
+                let b = (first[0] as isize + rows[1][at] as isize).min(layout.size[0] as isize);
+                if rows[0][at] == i16::MAX || voxel_j < 0 || voxel_j >= layout.size[1] as isize || a >= b {
+                    continue;
+                }
+                let (a, b, j, k) = (a as usize, b as usize, voxel_j as usize, voxel_k as usize);
+                for brick in a / EDGE..=(b - 1) / EDGE {
+                    let place = self.place_mut(layout.id([brick, j / EDGE, k / EDGE]));
+                    let (from, to) = (a.max(brick * EDGE) - brick * EDGE, b.min(brick * EDGE + EDGE) - brick * EDGE);
+                    extend(&mut self.spans[place][k % EDGE * EDGE + j % EDGE], [from as u8, to as u8]);
+                }
+            }
+        }
+    }
+
     /// Adds the voxels in a box of positions, relative to the voxel `first`.
     #[inline]
     fn add_box(&mut self, layout: &BrickLayout, first: [usize; 3], [low, high]: [f32x4; 2]) {
@@ -169,6 +234,37 @@ impl Cover {
                 }
             }
         }
+    }
+}
+
+/// By how much the spans of a brick's changed elements, in a box, are to be dilated; `None`: displacements are too large or too
+/// different for that to be tight.
+///
+/// The touched cells have corners s − 1 … s + 1 around a changed element s, so their images lie in s − 1 + u_low … s + 1 + u_high.
+fn dilation(mail: &ChainMail, first: [usize; 3], low: [usize; 3], high: [usize; 3]) -> Option<[[isize; 2]; 3]> {
+    let (layout, spacing) = (mail.layout(), mail.spacing());
+    let mut by = [[0.0f32; 2]; 3];
+    let bricks = |c: usize| (first[c] + low[c]).saturating_sub(1) / EDGE..=(first[c] + high[c] + 1).min(layout.size[c] - 1) / EDGE;
+    for bk in bricks(2) {
+        for bj in bricks(1) {
+            for bi in bricks(0) {
+                let range = mail.displacement_range(layout.id([bi, bj, bk]));
+                for c in 0..3 {
+                    by[c] = [by[c][0].min(range[c][0] / spacing[c]), by[c][1].max(range[c][1] / spacing[c])];
+                }
+            }
+        }
+    }
+    let near = |v: f32| v.abs() < (REACH - 1) as f32;
+    by.iter().flatten().all(|&v| near(v)).then(|| by.map(|[l, h]| [(l - SLACK).ceil() as isize - 1, (h + SLACK).floor() as isize + 1]))
+}
+
+/// Union of spans, row by row.
+#[inline]
+fn union(to: &mut [[i16; WIDE]; 2], from: &[[i16; WIDE]; 2]) {
+    for n in 0..WIDE {
+        to[0][n] = to[0][n].min(from[0][n]);
+        to[1][n] = to[1][n].max(from[1][n]);
     }
 }
 

@@ -1,7 +1,8 @@
 //! The voxels of one brick: pre-images row by row with the inversion kernel, then trilinear rest values.
 //!
 //! A row starts from the rows solved before it: the displacement of voxel (i, j, k) is guessed as d(j−1, k) + d(j, k−1) −
-//! d(j−1, k−1), which is exact wherever d is a sum of a function of j and one of k, as dents of cubic regions are.
+//! d(j−1, k−1), which is exact wherever d is a sum of a function of j and one of k, as dents of cubic regions are. Rows whose
+//! elements are all at rest need no solve: X = x.
 
 use crate::{
     MapOptions, MapReport,
@@ -13,7 +14,7 @@ use crate::{
 };
 use maille_chainmail::{ChainMail, DisplacementBrick};
 use maille_displacement::{DisplacementField, Inverter, Scheme};
-use maille_volume::{BrickId, BrickSource, brick::EDGE};
+use maille_volume::{Brick, BrickId, BrickSource, brick::EDGE};
 use wide::f32x4;
 
 /// Stored values of a brick's voxels; only those in the wanted spans mean something.
@@ -22,13 +23,15 @@ pub type Values = [i16; EDGE * EDGE * EDGE];
 /// Working memory of one thread.
 pub struct Workspace {
     pub window: Window,
+    /// rows to be solved
+    open: Box<Spans>,
     /// x − X of the rows solved [voxels]
     found: Box<[[f32x4; EDGE]; ROWS]>,
 }
 
 impl Workspace {
     pub fn new() -> Self {
-        Self { window: Window::new(), found: Box::new([[f32x4::ZERO; EDGE]; ROWS]) }
+        Self { window: Window::new(), open: Box::new([[0; 2]; ROWS]), found: Box::new([[f32x4::ZERO; EDGE]; ROWS]) }
     }
 }
 
@@ -48,62 +51,65 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         Self { rest, mail, inverter, void }
     }
 
-    /// Rest value of a voxel whose element did not move and is what is there now: all but voids, which tissue may have entered.
-    #[inline]
-    fn own_value(&self, [i, j, k]: [usize; 3]) -> Option<i16> {
-        let stored = self.rest.voxel(i, j, k);
-        let tissue = |t: f64| self.rest.info().rescale.value(f64::from(stored)) >= t;
-        self.mail.tissue().threshold_hu.is_none_or(tissue).then_some(stored)
-    }
-
     /// Solves the wanted voxels of a brick.
     pub fn brick(&self, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
         let mut report = MapReport::default();
-        let Some((low, high)) = bounds(spans) else { return report };
         let first = self.mail.layout().first_voxel(id);
+        let displacement = self.mail.displacement_brick(id).filter(|_| self.mail.displacement_range(id) != [[0.0; 2]; 3]);
+        // 1. rest values everywhere; what is left are the rows whose elements moved
+        let (rest, values) = (self.rest.brick(id), values.as_chunks_mut::<EDGE>().0);
+        let all_linked = self.mail.tissue().threshold_hu.is_none();
+        for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
+            let from = Brick::offset(0, (row % EDGE) as isize, (row / EDGE) as isize);
+            values[row].copy_from_slice(&rest.voxels[from..from + EDGE]);
+            report.voxels += u64::from(span[1] - span[0]);
+        }
+        let open = &mut *work.open;
+        for (row, span) in spans.iter().enumerate() {
+            open[row] = if all_linked { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) } else { *span };
+        }
+        let Some((low, high)) = bounds(open) else { return report };
         let voxels = Box3 { low: std::array::from_fn(|c| first[c] + low[c]), high: std::array::from_fn(|c| first[c] + high[c]) };
         work.window.gather(self.mail, preimage_box(self.mail, voxels));
-        let origin = work.window.low();
-        let mut sampler = RestSampler::new(self.rest, origin, work.window.size());
-        let displacement = self.mail.displacement_brick(id);
-        for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
+        if work.window.at_rest() {
+            return report;
+        }
+        let (window, found) = (&work.window, &mut *work.found);
+        let origin = window.low();
+        let mut sampler = RestSampler::new(self.rest, origin, window.size());
+        let local: [f32; 3] = std::array::from_fn(|c| first[c] as f32 - origin[c] as f32);
+        let (mut target, mut position, mut converged) = ([f32x4::ZERO; EDGE], [f32x4::ZERO; EDGE], [false; EDGE]);
+        for (row, span) in open.iter().enumerate().filter(|(_, s)| s[1] > 0) {
             let range = span[0] as usize..span[1] as usize;
-            report.voxels += range.len() as u64;
-            let out: &mut [i16; EDGE] = values.as_chunks_mut().0[row..].first_mut().expect("the row is one of the brick's");
-            if work.window.at_rest() {
-                for i in range {
-                    out[i] = self.rest.voxel(first[0] + i, first[1] + row % EDGE, first[2] + row / EDGE);
-                }
-                continue;
+            let out = &mut values[row];
+            // 2. pre-images, in positions relative to the window's first element
+            let (j, k) = (row % EDGE, row / EDGE);
+            let mut place = f32x4::new([local[0] + range.start as f32, local[1] + j as f32, local[2] + k as f32, 0.0]);
+            for x in &mut target[range.clone()] {
+                *x = place;
+                place += f32x4::new([1.0, 0.0, 0.0, 0.0]);
             }
-            // 1. pre-images, in positions relative to the window's first element
-            let local = |c: usize, v: usize| (first[c] + v) as f32 - origin[c] as f32;
-            let (y, z) = (local(1, row % EDGE), local(2, row / EDGE));
-            let target: [f32x4; EDGE] = std::array::from_fn(|i| f32x4::new([local(0, i), y, z, 0.0]));
-            let mut position = target;
-            guess(spans, &work.found, row, range.clone(), &mut position);
-            let mut converged = [false; EDGE];
-            report.iterations += u64::from(self.inverter.invert_row(&work.window, &target, range.clone(), &mut position, &mut converged));
+            let at = |c: usize, v: usize| first[c] + v - origin[c];
+            let own = &window.row(at(1, j), at(2, k))[at(0, range.start)..at(0, range.end)];
+            guess(open, found, own, row, range.clone(), &target, &mut position);
+            report.iterations += u64::from(self.inverter.invert_row(window, &target, range.clone(), &mut position, &mut converged));
             for i in range.clone() {
-                work.found[row][i] = target[i] - position[i];
+                found[row][i] = target[i] - position[i];
             }
-            // 2. values; the few that did not converge, and all beside voids, one by one
-            let all = converged[range.clone()].iter().all(|&c| c) && self.mail.tissue().threshold_hu.is_none();
-            for i in range {
-                let x = xyz(position[i]);
-                let voxel = [first[0] + i, first[1] + row % EDGE, first[2] + row / EDGE];
-                if at_rest(displacement, row * EDGE + i)
-                    && let Some(rest) = self.own_value(voxel)
-                {
-                    // X = x is the exact pre-image; the kernel stops within its tolerance of it
-                    out[i] = rest;
+            // 3. values; the few that did not converge, and all beside voids, one by one
+            let easy = all_linked && converged[range.clone()].iter().all(|&c| c);
+            for i in range.clone() {
+                let voxel = [first[0] + i, first[1] + j, first[2] + k];
+                // X = x is the exact pre-image of what did not move; the kernel stops within its tolerance of it
+                let still = f32x4::new(own[i - range.start]).simd_eq(f32x4::ZERO).to_bitmask() == 0b1111;
+                if still && (all_linked || self.is_tissue(out[i])) {
                     continue;
                 }
-                let value = if all {
-                    sampler.stored(x)
+                let value = if easy {
+                    sampler.stored(position[i])
                 } else {
-                    let hard = Hard { solver: self, window: &work.window, voxel, target: xyz(target[i]) };
-                    hard.value(&mut sampler, x, converged[i], &mut report)
+                    let hard = Hard { solver: self, window, voxel, target: xyz(target[i]) };
+                    hard.value(&mut sampler, xyz(position[i]), converged[i], &mut report)
                 };
                 report.voids += u64::from(value.is_none());
                 out[i] = value.unwrap_or(self.void);
@@ -111,30 +117,61 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         }
         report
     }
+
+    /// Whether a stored value is one of tissue: a void may be entered by others.
+    #[inline]
+    fn is_tissue(&self, stored: i16) -> bool {
+        self.mail.tissue().threshold_hu.is_none_or(|t| self.rest.info().rescale.value(f64::from(stored)) >= t)
+    }
 }
 
-/// Whether an element did not move, bit for bit.
+/// The part of a span of a brick's row between its first and its last moved element.
 #[inline]
-fn at_rest(displacement: Option<&DisplacementBrick>, element: usize) -> bool {
-    displacement.is_none_or(|d| d.u.iter().all(|plane| plane[element] == 0.0))
+fn moved_span(displacement: &DisplacementBrick, row: usize, [from, to]: [u8; 2]) -> [u8; 2] {
+    if to == 0 {
+        return [0; 2];
+    }
+    let [x, y, z] = displacement.u.each_ref().map(|plane| plane[row * EDGE..][..EDGE].as_chunks::<4>().0);
+    let mut moved = 0u64;
+    for part in 0..EDGE / 4 {
+        let any = f32x4::new(x[part]) | f32x4::new(y[part]) | f32x4::new(z[part]);
+        moved |= u64::from(any.simd_ne(f32x4::ZERO).to_bitmask()) << (4 * part);
+    }
+    moved &= u64::MAX << from & (u64::MAX >> (64 - u32::from(to)));
+    if moved == 0 { [0; 2] } else { [moved.trailing_zeros() as u8, 64 - moved.leading_zeros() as u8] }
 }
 
-/// Moves the starts of a row to where the rows before it say.
+/// Where a row starts: by the rows before it; where those are not there, by the voxels' own displacements.
 #[inline]
-fn guess(spans: &Spans, found: &[[f32x4; EDGE]; ROWS], row: usize, range: std::ops::Range<usize>, position: &mut [f32x4; EDGE]) {
-    let (j, k) = (row % EDGE, row / EDGE);
-    let none = [0u8, 0];
-    let (below, before) = (if j > 0 { spans[row - 1] } else { none }, if k > 0 { spans[row - EDGE] } else { none });
-    let corner = if j > 0 && k > 0 { spans[row - EDGE - 1] } else { none };
-    let has = |s: [u8; 2], i: usize| (s[0] as usize..s[1] as usize).contains(&i);
-    for i in range {
-        let start = &mut position[i];
-        match (has(below, i), has(before, i)) {
-            (true, true) if has(corner, i) => *start -= found[row - 1][i] + found[row - EDGE][i] - found[row - EDGE - 1][i],
-            (true, _) => *start -= found[row - 1][i],
-            (_, true) => *start -= found[row - EDGE][i],
-            _ => {}
+fn guess(
+    spans: &Spans,
+    found: &[[f32x4; EDGE]; ROWS],
+    own: &[[f32; 4]],
+    row: usize,
+    range: std::ops::Range<usize>,
+    target: &[f32x4; EDGE],
+    position: &mut [f32x4; EDGE],
+) {
+    let mut common = range.clone();
+    if row % EDGE > 0 && row >= EDGE {
+        for before in [row - 1, row - EDGE, row - EDGE - 1] {
+            common = common.start.max(spans[before][0].into())..common.end.min(spans[before][1].into());
         }
+    } else {
+        common.end = common.start;
+    }
+    if common.is_empty() {
+        common = range.end..range.end;
+    }
+    for i in (range.start..common.start).chain(common.end..range.end) {
+        position[i] = target[i] - f32x4::new(own[i - range.start]);
+    }
+    if common.is_empty() {
+        return;
+    }
+    let (below, before, corner) = (&found[row - 1], &found[row - EDGE], &found[row - EDGE - 1]);
+    for i in common {
+        position[i] = target[i] - (below[i] + before[i] - corner[i]);
     }
 }
 
@@ -179,9 +216,12 @@ impl<S: BrickSource + ?Sized> Hard<'_, '_, S> {
                 None => {}
             }
         }
-        sampler.stored(position)
+        sampler.stored(f32x4::new([position[0], position[1], position[2], 0.0]))
     }
 }
+
+/// A row's elements are bits of a word.
+const _: () = assert!(EDGE <= 64 && EDGE.is_multiple_of(4));
 
 /// Displacements fill a brick as voxels do.
 const _: () = assert!(DisplacementBrick::offset(EDGE - 1, EDGE - 1, EDGE - 1) + 1 == EDGE * EDGE * EDGE);

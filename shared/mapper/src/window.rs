@@ -87,8 +87,15 @@ impl Window {
                 };
                 let n = DisplacementBrick::offset(from - first[0], j - first[1], k - first[2]);
                 let [x, y, z] = [0, 1, 2].map(|c| &brick.u[c][n..n + count]);
-                for (i, out) in out.iter_mut().enumerate() {
-                    *out = (register([x[i], y[i], z[i]]) * per_mm).to_array();
+                let (out, rest) = out.as_chunks_mut::<4>();
+                let ((x, rx), (y, ry), (z, rz)) = (x.as_chunks::<4>(), y.as_chunks::<4>(), z.as_chunks::<4>());
+                for (n, out) in out.iter_mut().enumerate() {
+                    // four elements at once: three planes become four registers
+                    let planes = [f32x4::new(x[n]), f32x4::new(y[n]), f32x4::new(z[n]), f32x4::ZERO];
+                    *out = f32x4::transpose(planes).map(|v| (v * per_mm).to_array());
+                }
+                for (n, out) in rest.iter_mut().enumerate() {
+                    *out = (register([rx[n], ry[n], rz[n]]) * per_mm).to_array();
                 }
             }
         }
@@ -116,7 +123,8 @@ impl Window {
         let inside = local.fast_max(f32x4::ZERO).fast_min(self.last);
         let cell = inside.fast_min(self.last_cell).fast_trunc_int();
         let f = (inside - cell.round_float()).to_array();
-        let [i, j, k, _] = cell.to_array().map(|v| v as usize);
+        let [i, j, k, _] = cell.to_array();
+        let (i, j, k) = (i as usize, j as usize, k as usize);
         // what is no number and no zero (another processor's maximum) must not leave the window
         let at = ((k * self.size[1] + j) * self.size[0] + i).min(self.u.len() - 2 - self.size[0] * (self.size[1] + 1));
         (at, [f32x4::splat(f[0]), f32x4::splat(f[1]), f32x4::splat(f[2])], inside)
@@ -127,7 +135,8 @@ impl Window {
     fn pairs(&self, at: usize) -> [[f32x4; 2]; 4] {
         let (row, slice) = (self.size[0], self.size[0] * self.size[1]);
         let part = &self.u[at..at + slice + row + 2];
-        [0, row, slice, slice + row].map(|n| [f32x4::new(part[n]), f32x4::new(part[n + 1])])
+        let pair = |n: usize| [f32x4::new(part[n]), f32x4::new(part[n + 1])];
+        [pair(0), pair(row), pair(slice), pair(slice + row)]
     }
 }
 
@@ -146,7 +155,8 @@ impl RowField for Window {
     #[inline(always)]
     fn value(&self, local: f32x4) -> f32x4 {
         let (at, [x, y, z], _) = self.locate(local);
-        let [a, b, c, d] = self.pairs(at).map(|[low, high]| lerp(low, high, x));
+        let [a, b, c, d] = self.pairs(at);
+        let (a, b, c, d) = (lerp(a[0], a[1], x), lerp(b[0], b[1], x), lerp(c[0], c[1], x), lerp(d[0], d[1], x));
         lerp(lerp(a, b, y), lerp(c, d, y), z)
     }
 

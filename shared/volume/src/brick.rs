@@ -76,9 +76,20 @@ impl Brick {
 
     /// Recomputes the skip cells from the voxels; call it last when a brick was rewritten.
     pub fn summarise(&mut self) {
+        self.summarise_part([-(APRON_LOW as isize); 3], [(EDGE + APRON_HIGH - 1) as isize; 3]);
+    }
+
+    /// Recomputes the skip cells that may see a voxel of the box `low..=high` (−APRON_LOW … EDGE + APRON_HIGH − 1).
+    pub fn summarise_part(&mut self, low: [isize; 3], high: [isize; 3]) {
         const WIDTH: usize = EDGE + 1;
-        for ck in 0..CELLS_EDGE {
-            for cj in 0..CELLS_EDGE {
+        // cell c sees the samples CELL·c ..= CELL·c + CELL
+        let seeing = |c: usize| {
+            let last = (high[c].max(0) as usize / CELL).min(CELLS_EDGE - 1);
+            let first = (low[c].max(CELL as isize) as usize - CELL).div_ceil(CELL);
+            first..if high[c] < 0 { 0 } else { last + 1 }
+        };
+        for ck in seeing(2) {
+            for cj in seeing(1) {
                 // whole rows first, which vectorises, then the cells along i
                 let (mut low, mut high) = ([i16::MAX; WIDTH], [i16::MIN; WIDTH]);
                 for k in ck * CELL..=ck * CELL + CELL {
@@ -90,7 +101,7 @@ impl Brick {
                         }
                     }
                 }
-                for ci in 0..CELLS_EDGE {
+                for ci in seeing(0) {
                     let part = ci * CELL..=ci * CELL + CELL;
                     let least = low[part.clone()].iter().fold(i16::MAX, |l, &v| l.min(v));
                     let most = high[part].iter().fold(i16::MIN, |h, &v| h.max(v));
@@ -298,6 +309,25 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_part_summarised_anew_is_all_that_a_change_needs() {
+        let v = volume([50, 40, 40]);
+        let mut brick = *BrickedVolume::from_volume(&v).brick(0);
+        for (low, high) in [([-1; 3], [-1, 3, 3]), ([4, 0, 16], [4, 17, 17]), ([5, 15, 3], [8, 16, 4]), ([-1; 3], [17; 3])] {
+            for k in low[2]..=high[2] {
+                for j in low[1]..=high[1] {
+                    for i in low[0]..=high[0] {
+                        brick.voxels[Brick::offset(i, j, k)] = (1000 * i - 700 * j + 90 * k) as i16;
+                    }
+                }
+            }
+            let mut all = brick;
+            all.summarise();
+            brick.summarise_part(low, high);
+            assert!(brick.cells == all.cells, "{low:?} {high:?}");
         }
     }
 
