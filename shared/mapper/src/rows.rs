@@ -24,7 +24,7 @@ pub const ROWS: usize = EDGE * EDGE;
 pub type Spans = [[u8; 2]; ROWS];
 
 /// Cells covered at a time along a row: shorter runs cover less, longer ones cost less.
-const RUN: isize = 6;
+const RUN: isize = 8;
 /// Corners along i that the cells of a brick's row and of its neighbours have.
 const CORNERS: usize = EDGE + 2;
 /// f32 holds indices inside a brick to 1e-3 voxel and better; the slack covers that.
@@ -158,7 +158,7 @@ impl Cover {
         // ends of spans as planes, so that unions are lane-wise minima and maxima; empty: the ends are crossed
         const EMPTY: [[i16; WIDE]; 2] = [[i16::MAX; WIDE], [i16::MIN; WIDE]];
         let mut in_plane = [EMPTY; EDGE];
-        for k in low[2]..=high[2] {
+        for (k, plane) in in_plane.iter_mut().enumerate().take(high[2] + 1).skip(low[2]) {
             let mut rows = EMPTY;
             for j in low[1]..=high[1] {
                 let [a, b] = changed.spans[k * EDGE + j];
@@ -169,10 +169,10 @@ impl Cover {
             for shift in by[1][0]..=by[1][1] {
                 // row j goes to j + shift; what a shift carries round the end is empty: spans lie REACH inside
                 let mut moved = rows;
-                for plane in &mut moved {
-                    plane.rotate_right(shift.rem_euclid(WIDE as isize) as usize);
+                for ends in &mut moved {
+                    ends.rotate_right(shift.rem_euclid(WIDE as isize) as usize);
                 }
-                union(&mut in_plane[k], &moved);
+                union(plane, &moved);
             }
         }
         let ends = |c: usize| low[c] as isize + by[c][0]..=high[c] as isize + by[c][1];

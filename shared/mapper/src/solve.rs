@@ -153,7 +153,7 @@ fn guess(
     position: &mut [f32x4; EDGE],
 ) {
     let mut common = range.clone();
-    if row % EDGE > 0 && row >= EDGE {
+    if !row.is_multiple_of(EDGE) && row >= EDGE {
         for before in [row - 1, row - EDGE, row - EDGE - 1] {
             common = common.start.max(spans[before][0].into())..common.end.min(spans[before][1].into());
         }
