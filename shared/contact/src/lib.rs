@@ -29,10 +29,12 @@ pub mod shaper;
 pub mod surface;
 mod tick;
 mod toolmove;
+mod velocity;
 
 pub use coupling::{Coupling, CouplingError};
 pub use device::{ConsoleDevice, Device, DevicePose, Easing, Grip, Path, PathDevice, PathError, SimulatedHand, WayPoint};
 pub use material::{Material, TissueTable};
+pub use passivity::{Passivity, Port};
 pub use proxy::{Contact, Proxy, Touch};
 pub use shaper::{ForceShaper, Limits};
 pub use surface::{AnalyticSurface, Isosurface, Surface};

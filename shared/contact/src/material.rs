@@ -55,6 +55,19 @@ impl Material {
         a1 * d + a2 * d * d + (depth_mm - d) * max_slope
     }
 
+    /// Energy [mJ] stored at indentation `depth_mm`: the integral of [`Material::normal_force`].
+    #[inline]
+    pub fn normal_energy(&self, depth_mm: f64, max_slope: f64) -> f64 {
+        if depth_mm.is_nan() || depth_mm <= 0.0 {
+            return 0.0;
+        }
+        let (a1, a2) = (self.stiffness_n_per_mm.min(max_slope), self.stiffening_n_per_mm2);
+        let knee = if a2 > 0.0 { (max_slope - a1) / (2.0 * a2) } else { f64::INFINITY };
+        let d = depth_mm.min(knee);
+        let beyond = depth_mm - d;
+        d * d * (0.5 * a1 + a2 * d / 3.0) + beyond * (a1 * d + a2 * d * d + 0.5 * max_slope * beyond)
+    }
+
     /// A material between two, `t` from 0 to 1.
     pub fn between(&self, other: &Self, t: f64) -> Self {
         let mix = |a: f64, b: f64| a + (b - a) * t;
@@ -147,6 +160,18 @@ mod tests {
         assert_eq!(m.normal_force(-1.0, 1.0), 0.0);
         assert_eq!(m.normal_force(f64::NAN, 1.0), 0.0);
         assert!((Material::BONE.normal_force(3.0, 0.5) - 1.5).abs() < 1e-12);
+    }
+
+    #[test]
+    fn force_is_the_slope_of_the_energy() {
+        for m in [Material::SOFT, Material::BONE, Material { stiffness_n_per_mm: 0.2, stiffening_n_per_mm2: 0.05, ..Material::SOFT }] {
+            for n in 1..600 {
+                let d = f64::from(n) * 0.01;
+                let slope = (m.normal_energy(d + 1e-5, 0.6) - m.normal_energy(d - 1e-5, 0.6)) / 2e-5;
+                assert!((slope - m.normal_force(d, 0.6)).abs() < 1e-6, "{d}");
+            }
+        }
+        assert_eq!(Material::SOFT.normal_energy(f64::NAN, 1.0), 0.0);
     }
 
     #[test]

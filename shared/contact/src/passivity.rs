@@ -1,56 +1,134 @@
 //! Passivity observer and controller on the device port.
 //!
-//! Observer: E(n) = E(n−1) − F(n−1)·(x(n) − x(n−1)), the energy [mJ = N·mm] that went from the hand into the virtual side; exact
-//! for a force held between ticks. Poses that are late by a known number of ticks are paired with the force of their own
-//! interval; what the forces since then may have given out is not seen yet and counts as |F| |v| T each. Controller: when
-//! E < 0 the virtual side has given out more than it got, and a damper α = min(−E / (|v|² T), α_max) on the port takes it back
-//! [Hannaford & Ryu 2002, impedance form, series in time]; and a push that would give out more than is stored before it is
-//! seen is lowered to what is stored, so that a deficit is hardly made in the first place.
-//! With late poses the estimate is no proof: the port is bounded by experiment only (`tests/stability.rs`).
+//! **Observer.** E = −Σ F_k·(x_{k+1} − x_k), the energy [mJ = N·mm] that went from the hand into the virtual side; exact for a force held
+//! between ticks [Hannaford & Ryu 2002]. The positions seen are late by d ticks, so each is paired with the force of its own interval, and
+//! rounded, q = x − e with |e| ≤ Δ/2 by axis. Summed by parts,
 //!
-//! A reserve caps how much stored energy counts: without it an hour of dissipation would license minutes of buzzing.
-//! Units: mm, N, s. Cost: proportional to the delay in ticks, at most 32. Allocation: none. Not here: choosing gains that
+//! E = −Σ F_k·(q_{k+1} − q_k) + Σ (F_k − F_{k−1})·e_k − F_{n−1}·e_n ,
+//!
+//! where e is known to ±Δ/2 only, and better after a step of one Δ: the border between both readings has then just been crossed, and dead
+//! reckoning goes on from there. The middle term is taken at the best guess of e, less a doubt: the least of all the largest errors, and four standard
+//! deviations plus three tenths of all the largest errors (rounding in a repeated motion may repeat). So rounding does not pass for stored
+//! energy: measured, the observer is never over the truth by more than 0.1 mJ (`tests/passivity.rs`).
+//!
+//! **Controller.** The force is held for a tick, and d ticks of motion are not seen yet. What F_{n−d} … F_n may give out until t_{n+1} is
+//! foreseen with the least mass m of device and hand: the velocity (`velocity`, and half of its largest error) goes on, quickened by the
+//! forces themselves over m and by the hand. F_n = λ F_wanted with the largest λ ≤ 1 for which this does not exceed what is stored
+//! [the force is bounded by energy beforehand, as in Kim & Ryu's energy-bounding algorithm; here against the observed balance, without counting on the
+//! device's own damping]. A force that only takes energy is not lowered, and F_n = 0 is always open. Slow leaks, of a tool that rests, are
+//! made good by Hannaford and Ryu's damper, −α v with α rising to α_max as the balance falls.
+//! Without Coulomb friction of K·Δ/2 in the device a light hand that rests on a stiff wall keeps a limit cycle alive [Abbott & Okamura 2005]; the
+//! controller then lets the wall give way rather than feed it.
+//!
+//! **Reference.** What counts as stored is at most the elastic energy that the contact reports plus a reserve, so an hour of dissipation
+//! does not license minutes of buzzing [a bounded reference for the energy: Ryu et al. 2005]. Work done by tissue that moves by itself is granted (`grant`).
+//!
+//! Units: mm, N, s, kg. Cost: proportional to the delay in ticks, at most 31. Allocation: none. Not here: choosing gains that
 //! need no controller (`coupling`).
 
-use crate::V3;
+use crate::{V3, velocity::Velocity};
 
 /// Most ticks a pose can be late.
 pub const MAX_DELAY: usize = 32;
+/// Energy the port may give out in advance [mJ]: half of what it shall never exceed.
+const ADVANCE_MJ: f64 = 0.5;
+
+/// Part of the largest errors of velocity and acceleration that counts when energy is foreseen: what comes out worse is seen in the balance
+/// at the next tick.
+const SLACK: f64 = 0.5;
+/// Part of the sum of the largest rounding errors that counts as doubt.
+const DOUBT: f64 = 0.3;
+/// Time in which a lowered force comes back [s].
+const SHARE_S: f64 = 0.02;
+
+/// What the controller knows of the device's port.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Port {
+    /// how late poses are [ticks], at most 31
+    pub delay_ticks: usize,
+    /// encoder step at the tip [mm]
+    pub quantum_mm: f64,
+    /// least mass at the tip, device and hand [kg]
+    pub mass_kg: f64,
+    /// largest acceleration that the hand adds [mm/s²]
+    pub hand_mm_s2: f64,
+}
+
+impl Default for Port {
+    /// Poses at once and exact; a light desktop device.
+    fn default() -> Self {
+        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0 }
+    }
+}
 
 /// Observer and controller of one port.
 #[derive(Clone, Copy, Debug)]
 pub struct Passivity {
+    port: Port,
+    /// lower bound of E [mJ]
     energy_mj: f64,
     last_position: Option<V3>,
+    /// e at the last position, by axis, and how far it may be from that [mm]
+    rounding: [(f64, f64); 3],
+    velocity: Velocity,
     /// forces given, by tick modulo the length [N]
-    given: [V3; MAX_DELAY],
+    given: [V3; MAX_DELAY + 2],
     ticks: usize,
-    delay: usize,
     reserve_mj: f64,
     max_damping_n_s_per_mm: f64,
     dissipated_mj: f64,
+    lowered: u64,
+    /// λ of the last tick
+    share: f64,
+    /// sum of the largest errors of E by rounding [mJ]
+    doubt_mj: f64,
+    /// sum of their variances [mJ²]
+    doubt_squared: f64,
 }
 
 impl Passivity {
-    /// `reserve_mj`: most energy that counts as stored [mJ]; `max_damping_n_s_per_mm`: α_max, which must keep the coupling's bound;
-    /// `delay_ticks`: how late poses are, at most 31.
+    /// `reserve_mj`: most energy beyond the elastic one that counts as stored [mJ]; `max_damping_n_s_per_mm`: α_max, which must keep the
+    /// coupling's bound; `delay_ticks`: how late poses are, at most 31.
     pub fn new(reserve_mj: f64, max_damping_n_s_per_mm: f64, delay_ticks: usize) -> Self {
+        Self::on_port(reserve_mj, max_damping_n_s_per_mm, Port { delay_ticks, ..Port::default() })
+    }
+
+    /// The same for a port of which more is known. Numbers out of range are held in range.
+    pub fn on_port(reserve_mj: f64, max_damping_n_s_per_mm: f64, port: Port) -> Self {
+        let hold = |v: f64, low: f64, high: f64, other: f64| if v.is_finite() { v.clamp(low, high) } else { other };
+        let port = Port {
+            delay_ticks: port.delay_ticks.min(MAX_DELAY - 1),
+            quantum_mm: hold(port.quantum_mm, 0.0, 1.0, 0.0),
+            mass_kg: hold(port.mass_kg, 0.01, 10.0, 0.05),
+            hand_mm_s2: hold(port.hand_mm_s2, 0.0, 1e6, 1e4),
+        };
         Self {
+            port,
             energy_mj: 0.0,
             last_position: None,
-            given: [V3::zeros(); MAX_DELAY],
+            rounding: [(0.0, 0.0); 3],
+            velocity: Velocity::new(),
+            given: [V3::zeros(); MAX_DELAY + 2],
             ticks: 0,
-            delay: delay_ticks.min(MAX_DELAY - 1),
-            reserve_mj: reserve_mj.max(0.0),
-            // a damper that acts late feeds what it should brake: tolerable gains fall with the delay
-            max_damping_n_s_per_mm: max_damping_n_s_per_mm.max(0.0) / ((1 + delay_ticks) as f64).powi(2),
+            reserve_mj: hold(reserve_mj, 0.0, 1e3, 0.0),
+            // a damper that acts late feeds what it should brake: tolerable are gains far below m / t_d
+            max_damping_n_s_per_mm: max_damping_n_s_per_mm.clamp(0.0, 0.3 * port.mass_kg / (port.delay_ticks as f64 + 0.5)),
             dissipated_mj: 0.0,
+            lowered: 0,
+            share: 1.0,
+            doubt_mj: 0.0,
+            doubt_squared: 0.0,
         }
     }
 
-    /// Energy the virtual side holds [mJ]; negative when it has given out more than it got.
+    /// Energy the virtual side holds at least [mJ]; negative when it may have given out more than it got.
     pub fn energy_mj(&self) -> f64 {
-        self.energy_mj
+        self.certain_mj()
+    }
+
+    /// E less what rounding may have added.
+    fn certain_mj(&self) -> f64 {
+        self.energy_mj - self.doubt_mj.min(4.0 * self.doubt_squared.sqrt() + DOUBT * self.doubt_mj)
     }
 
     /// Energy that the controller has asked its damper to take, so far [mJ].
@@ -58,43 +136,128 @@ impl Passivity {
         self.dissipated_mj
     }
 
+    /// Ticks whose force was lowered.
+    pub fn lowered(&self) -> u64 {
+        self.lowered
+    }
+
     /// Forgets motion, keeps the balance; after a jump that was no motion.
     pub fn forget_motion(&mut self) {
         self.last_position = None;
+        self.velocity.reset();
+    }
+
+    /// Work [mJ] that moving tissue does on the hand: no fault of the rendering, so it may be given out.
+    pub fn grant(&mut self, work_mj: f64) {
+        if work_mj > 0.0 {
+            self.energy_mj += work_mj;
+        }
     }
 
     /// The force given `ago` ticks before the last.
     fn force_ago(&self, ago: usize) -> V3 {
-        self.given[(self.ticks + 2 * MAX_DELAY - 1 - ago) % MAX_DELAY]
+        let length = self.given.len();
+        self.given[(self.ticks + 2 * length - 1 - ago) % length]
     }
 
-    /// The force to give in place of `wanted`, with the device seen at `position` after `dt_s`.
-    pub(crate) fn control(&mut self, position: V3, wanted: V3, dt_s: f64) -> V3 {
-        let moved = self.last_position.map_or(V3::zeros(), |last| position - last);
-        self.energy_mj = (self.energy_mj - self.force_ago(self.delay).dot(&moved)).min(self.reserve_mj);
-        self.last_position = Some(position);
-        let pending: f64 = (0..self.delay).map(|ago| self.force_ago(ago).norm() * moved.norm()).sum();
-        let stored = self.energy_mj - pending;
+    /// The force to give in place of `wanted`, with the device seen at `position` after `dt_s`, when the contact's springs hold
+    /// `elastic_mj`.
+    pub(crate) fn control(&mut self, position: V3, wanted: V3, elastic_mj: f64, dt_s: f64) -> V3 {
+        self.observe(position, dt_s);
+        // what is beyond the reference is forgotten
+        let surplus = self.certain_mj() - (elastic_mj + self.reserve_mj);
+        if surplus > 0.0 {
+            self.energy_mj -= surplus;
+        }
+        let per_mass = 1000.0 / self.port.mass_kg;
+        let delay = self.port.delay_ticks;
+        let last = self.force_ago(delay);
+        let estimate = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2 + per_mass * last.norm());
+        // what the pending forces may have given out since the position that is seen
+        let mut stored = self.certain_mj() + ADVANCE_MJ - 0.5 * self.port.quantum_mm * one_norm(&last);
+        let (mut velocity, mut slack) = (estimate.velocity, SLACK * estimate.error);
+        for ago in (0..delay).rev() {
+            let force = self.force_ago(ago);
+            let quickened = force * (per_mass * dt_s);
+            slack += SLACK * self.port.hand_mm_s2 * dt_s;
+            stored -= (force.dot(&(velocity + quickened * 0.5)) + force.norm() * slack) * dt_s;
+            velocity += quickened;
+        }
+        slack += SLACK * self.port.hand_mm_s2 * dt_s;
         let mut force = wanted;
-        let power = moved.norm_squared();
-        if stored < 0.0 && dt_s > 0.0 && power > 1e-12 {
-            let alpha = (-stored * dt_s / power).min(self.max_damping_n_s_per_mm);
-            self.dissipated_mj += alpha * power / dt_s;
-            force -= moved * (alpha / dt_s);
+        let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
+        if deficit > 0.0 && wanted.norm_squared() > 0.0 {
+            let alpha = deficit * self.max_damping_n_s_per_mm;
+            self.dissipated_mj += alpha * estimate.smooth.norm_squared() * dt_s;
+            force -= estimate.smooth * alpha;
         }
-        // what the next tick would give out, with the poses' delay as its horizon
-        let next = force.dot(&moved) * (1 + self.delay) as f64;
-        if next > 0.0 && next > stored {
-            force *= (stored / next).clamp(0.0, 1.0);
-        }
-        force
+        let out = (force.dot(&velocity) + force.norm() * slack) * dt_s;
+        let quickening = 0.5 * per_mass * force.norm_squared() * dt_s * dt_s;
+        let share = largest_share(quickening, out, stored.max(0.0));
+        // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
+        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + dt_s / SHARE_S } else { 1.0 });
+        self.lowered += u64::from(self.share < 1.0);
+        force * self.share
     }
 
-    /// Tells the observer what the device was really given, after limits.
+    /// Takes the work of the interval that the new position ends into the balance.
+    fn observe(&mut self, position: V3, dt_s: f64) {
+        let Some(last) = self.last_position.replace(position) else {
+            self.rounding = [(0.0, 0.5 * self.port.quantum_mm); 3];
+            self.velocity.push(position);
+            return;
+        };
+        self.velocity.push(position);
+        let moved = position - last;
+        let force = self.force_ago(self.port.delay_ticks);
+        let change = force - self.force_ago(self.port.delay_ticks + 1);
+        self.energy_mj -= force.dot(&moved);
+        let quantum = self.port.quantum_mm;
+        if quantum > 0.0 {
+            let smooth = self.velocity.estimate(quantum, dt_s, self.port.hand_mm_s2).smooth;
+            for c in 0..3 {
+                let (e, doubt) = self.rounding[c];
+                self.energy_mj += change[c] * e;
+                let doubt = change[c].abs() * doubt;
+                self.doubt_mj += doubt;
+                self.doubt_squared += doubt * doubt / 3.0;
+                self.rounding[c] = rounding(self.rounding[c], moved[c] / quantum, smooth[c] * dt_s, quantum);
+            }
+        }
+    }
+
+    /// Tells the observer what the device was really given.
     pub(crate) fn given(&mut self, force: V3) {
-        self.given[self.ticks % MAX_DELAY] = force;
+        let length = self.given.len();
+        self.given[self.ticks % length] = force;
         self.ticks += 1;
     }
+}
+
+fn one_norm(v: &V3) -> f64 {
+    v.iter().map(|c| c.abs()).sum()
+}
+
+/// Where in its encoder step the position is, as offset and doubt [mm], after the reading went on by `steps` and the tip by about `way`
+/// [mm]. One step on: the border between both readings was just crossed; no step: dead reckoning from there.
+fn rounding((e, doubt): (f64, f64), steps: f64, way: f64, quantum: f64) -> (f64, f64) {
+    let half = 0.5 * quantum;
+    let (e, doubt) = match steps.abs() {
+        s if s < 0.5 => (e + way, doubt + 1.0 * way.abs() + 0.002 * quantum),
+        s if s < 1.5 => ((0.5 * way.abs() - half) * steps.signum(), 0.5 * way.abs() + 0.01 * quantum),
+        _ => (0.0, half),
+    };
+    let (low, high) = ((e - doubt).clamp(-half, half), (e + doubt).clamp(-half, half));
+    (0.5 * (low + high), 0.5 * (high - low))
+}
+
+/// Largest λ in 0 … 1 with a λ² + b λ ≤ c, for a, c ≥ 0.
+fn largest_share(a: f64, b: f64, c: f64) -> f64 {
+    if a + b <= c {
+        return 1.0;
+    }
+    let root = if a > 0.0 { (-b + (b * b + 4.0 * a * c).sqrt()) / (2.0 * a) } else { c / b };
+    if root.is_finite() { root.clamp(0.0, 1.0) } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -112,7 +275,7 @@ mod tests {
             let mut worst = 0.0f64;
             for _ in 0..5000 {
                 let wanted = V3::new(0.0, 0.0, if x < 0.0 { -k * x } else { 0.0 });
-                let f = if controlled { p.control(V3::new(0.0, 0.0, x), wanted, dt) } else { wanted };
+                let f = if controlled { p.control(V3::new(0.0, 0.0, x), wanted, 0.5 * k * x.min(0.0).powi(2), dt) } else { wanted };
                 p.given(f);
                 for _ in 0..20 {
                     let hand = -0.5; // a light push towards the wall

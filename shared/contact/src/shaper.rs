@@ -64,6 +64,11 @@ impl ForceShaper {
         self.last.into()
     }
 
+    /// Tells that a force smaller than the last shaped one was given: what was cut for passivity is not to be risen from.
+    pub(crate) fn cut_to(&mut self, force: V3) {
+        self.last = clamp_norm(force, self.limits.max_force_n);
+    }
+
     /// The force to give [N] when `wanted_n` is wanted, `dt_s` after the last call; `fading` while it shall go to zero.
     pub fn shape(&mut self, wanted_n: [f64; 3], dt_s: f64, fading: bool) -> [f64; 3] {
         let dt = if dt_s.is_finite() { dt_s.clamp(0.0, MAX_STEP_S) } else { 0.0 };

@@ -16,7 +16,7 @@
 //! **Blend.** What remains of a discontinuity (normal and tangential direction at a commit, a foot that jumps to another wall, a new
 //! threshold) is bridged: the difference to the last force is added and taken away linearly within `blend_s`.
 //!
-//! **Order**: pose checks · proxy · give-way · tissue law, damping, friction · blend · passivity · limits and fades · tool
+//! **Order**: pose checks · proxy · give-way · tissue law, damping, friction · blend · limits and fades · passivity · tool
 //! move. Degraded modes: pose invalid, stale or not finite → the last pose is kept and the force fades; snapshot too old → fade;
 //! jump → the proxy starts anew, buried where it lands in tissue; time backwards → nominal step. Each is counted in
 //! [`Faults`]. Replay: the same inputs give the same outputs, bit by bit.
@@ -29,7 +29,7 @@ use crate::{
     friction::Friction,
     limits::{MAX_JUMP_MM, MAX_STEP_S},
     material::{Material, TissueTable},
-    passivity::Passivity,
+    passivity::{Passivity, Port},
     proxy::{Proxy, Touch},
     shaper::{ForceShaper, Limits},
     surface::Surface,
@@ -48,6 +48,8 @@ const VELOCITY_S: f64 = 0.005;
 const DAMPING_DEPTH_MM: f64 = 0.5;
 /// The material is read this far below the surface [mm]: at the surface itself every tissue has the threshold's value.
 const MATERIAL_DEPTH_MM: f64 = 1.5;
+/// Energy beyond the elastic one that the passivity controller counts as stored [mJ].
+const RESERVE_MJ: f64 = 2.0;
 /// Largest give-way that is believed [mm].
 const MAX_GIVE_WAY_MM: f64 = 60.0;
 
@@ -78,6 +80,10 @@ pub struct HapticConfig {
     pub passivity_damping_n_s_per_mm: f64,
     /// how late the device's poses are [ticks], where it is known; the passivity observer needs it
     pub pose_delay_ticks: usize,
+    /// encoder step at the tip [mm], 0 where it is not known; the passivity observer needs it
+    pub pose_quantum_mm: f64,
+    /// least mass at the tip, device and hand [kg]; the passivity controller needs it
+    pub device_mass_kg: f64,
 }
 
 impl HapticConfig {
@@ -96,6 +102,8 @@ impl HapticConfig {
             passivity: false,
             passivity_damping_n_s_per_mm: 0.03,
             pose_delay_ticks: 0,
+            pose_quantum_mm: 0.0,
+            device_mass_kg: Port::default().mass_kg,
         }
     }
 }
@@ -202,6 +210,8 @@ pub struct HapticCore {
     /// force before limits at the last tick [N]
     last_wanted: V3,
     bridge: Bridge,
+    /// energy in the contact's springs [mJ]
+    elastic_mj: f64,
 }
 
 impl HapticCore {
@@ -210,10 +220,16 @@ impl HapticCore {
         let mut config = config;
         config.blend_s = if config.blend_s.is_finite() { config.blend_s.clamp(0.01, 1.0) } else { 0.02 };
         config.period_s = if config.period_s.is_finite() { config.period_s.clamp(1e-5, MAX_STEP_S) } else { 1e-3 };
+        let port = Port {
+            delay_ticks: config.pose_delay_ticks,
+            quantum_mm: config.pose_quantum_mm,
+            mass_kg: config.device_mass_kg,
+            ..Port::default()
+        };
         Self {
             proxy: Proxy::new(config.radius_mm),
             friction: Friction::default(),
-            passivity: Passivity::new(5.0, config.passivity_damping_n_s_per_mm, config.pose_delay_ticks),
+            passivity: Passivity::on_port(RESERVE_MJ, config.passivity_damping_n_s_per_mm, port),
             shaper: ForceShaper::new(config.limits),
             gate: MoveGate::default(),
             faults: Faults::default(),
@@ -229,6 +245,7 @@ impl HapticCore {
             material: None,
             last_wanted: V3::zeros(),
             bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
+            elastic_mj: 0.0,
             config,
         }
     }
@@ -281,9 +298,14 @@ impl HapticCore {
             wanted = self.touch(tissue, inputs, x, dt, jumped, &mut out);
         }
         self.last_wanted = wanted;
-        let wanted = if self.config.passivity && self.position.is_some() { self.passivity.control(x, wanted, dt) } else { wanted };
         // a late tick gets no larger a step: what the hand would feel is one tick's change
         out.force_n = self.shaper.shape(wanted.into(), dt.min(self.config.period_s), fading);
+        if self.config.passivity && self.position.is_some() {
+            // after the limits: a fall that the slew limit would stretch may be more than is stored
+            let force = self.passivity.control(x, V3::from(out.force_n), self.elastic_mj, dt);
+            self.shaper.cut_to(force);
+            out.force_n = self.shaper.last_n();
+        }
         self.passivity.given(V3::from(out.force_n));
         out.fading = fading;
         out.faults = self.faults;
@@ -436,6 +458,7 @@ impl HapticCore {
         let coupling = &self.config.coupling;
         let damping = material.damping_n_s_per_mm.min(coupling.damping_n_s_per_mm()) * (delta / DAMPING_DEPTH_MM).min(1.0);
         let elastic = material.normal_force(delta, coupling.stiffness_n_per_mm());
+        self.elastic_mj = material.normal_energy(delta, coupling.stiffness_n_per_mm());
         // pressed in: resists; withdrawn: damping may only lower the push, never pull
         let normal_n = (elastic - damping * self.velocity.dot(&normal)).max(0.0);
         let mut force = normal * normal_n;
@@ -461,6 +484,7 @@ impl HapticCore {
         self.give_way = 0.0;
         self.bias = 0.0;
         self.gap = 0.0;
+        self.elastic_mj = 0.0;
         self.last_point = None;
         self.material = None;
         self.friction.release();
