@@ -131,7 +131,7 @@ struct Memory {
 
 impl Memory {
     fn of(plan: &Plan, info: &VolumeInfo) -> Self {
-        let sizes = StoreSizes { spare_slots: plan.version_slots, displacement_slots: plan.displacement_slots };
+        let sizes = StoreSizes::by_segment(|segment| plan.slots(segment));
         let mut segments: Vec<_> = plan.segments.iter().map(|s| (s.name, s.bytes, s.meaning)).collect();
         for (name, bytes) in (StorePlan { info: info.clone(), sizes }).segments() {
             // the store knows its own tables; of bricks both say the same

@@ -9,6 +9,7 @@
 
 #![forbid(unsafe_code)]
 
+mod announce;
 mod restore;
 mod state;
 mod step;
@@ -17,8 +18,8 @@ use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::TOOL_IN_CONTACT;
 use maille_contract::{Commit, ControlBlock, Role, ToolMove, ToolState, ViewState};
 use maille_scene::Scene;
-use maille_store::{CommitOutcome, Reader, Writer};
-use maille_transport::{Domain, Life, Node, Publisher, monotonic_ns};
+use maille_store::{Reader, Writer};
+use maille_transport::{Domain, Life, Node, monotonic_ns};
 use std::{sync::atomic::Ordering::Relaxed, time::Duration};
 use thiserror::Error;
 
@@ -41,6 +42,9 @@ const POLL: Duration = Duration::from_millis(2);
 /// Shortest time between relaxation steps, and how long no push may have come before the first [ns].
 const RELAX_NS: u64 = 33_000_000;
 
+/// The epoch that shows the volume at rest.
+const FIRST_EPOCH: u64 = 1;
+
 /// Runs until the run ends.
 ///
 /// # Errors
@@ -50,7 +54,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
     let mut life = Life::begin(&domain, Role::Deformation)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| DeformationError::Scene(e.to_string()))?;
     let node = Node::open(&domain, "deformation")?;
-    let (moves, commits) = (node.subscriber::<ToolMove>()?, node.publisher::<Commit>()?);
+    let (moves, mut announcer) = (node.subscriber::<ToolMove>()?, announce::Announcer::new(node.publisher::<Commit>()?));
     let (mut writer, reader) = (Writer::open(&domain)?, Reader::open(&domain, Role::Deformation)?);
     if let Some(threads) = scene.deformation.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
@@ -58,8 +62,11 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
     let mut engine = step::Engine::new(&scene, reader.info());
     restore::restore(&mut engine, &writer);
     life.ready();
+    if writer.epoch() > FIRST_EPOCH {
+        announcer.standing(&life, writer.epoch());
+    }
     let shortest_ns = (1e9 / scene.deformation.rate_hz) as u64;
-    let (mut last_step, mut sent, mut refused_view) = (0u64, 0u64, 0u64);
+    let (mut last_step, mut refused_view) = (0u64, 0u64);
     while life.beat(monotonic_ns()) {
         if let Some((view, generation)) = life.control().view.load::<ViewState>() {
             match view.checked() {
@@ -72,6 +79,9 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             }
         }
         let now = monotonic_ns();
+        if let Some(epoch) = writer.publish_deferred() {
+            announcer.published(&life, epoch);
+        }
         // while too much waits to become visible (a stopped reader holds the slots) the tissue stands; the newest move stays queued
         let due = now.saturating_sub(last_step) >= shortest_ns && writer.has_room();
         let Some(message) = due.then(|| moves.latest()).flatten() else {
@@ -79,8 +89,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
                 let dt_s = (now - last_step).min(2 * RELAX_NS) as f64 * 1e-9;
                 last_step = now;
                 if let Some(done) = engine.relax(dt_s, &reader, &mut writer) {
-                    sent += 1;
-                    publish(&mut life, &commits, &done, now, sent, 0);
+                    announcer.step(&mut life, &done, now, None);
                     continue;
                 }
             }
@@ -94,8 +103,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
         };
         last_step = now;
         if let Some(done) = engine.step(&message, &reader, &mut writer) {
-            sent += 1;
-            publish(&mut life, &commits, &done, now, sent, message.stamp.sequence);
+            announcer.step(&mut life, &done, now, Some(message.stamp.sequence));
         }
     }
     Ok(())
@@ -105,25 +113,4 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
 fn touched(control: &ControlBlock) -> bool {
     let silent = monotonic_ns().saturating_sub(control.service(Role::Haptic).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
     !silent && control.tool.load::<ToolState>().is_some_and(|(tool, _)| tool.flags & TOOL_IN_CONTACT != 0)
-}
-
-/// Records a step and tells the others.
-fn publish(life: &mut Life, commits: &Publisher<Commit>, done: &step::Done, began_ns: u64, sequence: u64, cause: u64) {
-    let step_ns = monotonic_ns() - began_ns;
-    life.record(began_ns, step_ns, None);
-    let cell = life.cell();
-    cell.count(Counter::MovedElements, done.moved_elements);
-    cell.count(Counter::Failures, done.failures);
-    match done.outcome {
-        CommitOutcome::Published { epoch, .. } => {
-            cell.count(Counter::Commits, 1);
-            let stamp = life.stamp(sequence);
-            let (moved_elements, bricks, refused_mm) = (done.moved_elements, done.bricks, done.refused_mm);
-            // the epoch itself is in the store; the message is news, and the next one will do
-            let _ = commits.send(&Commit { stamp, epoch, cause, moved_elements, bricks, step_ns, refused_mm });
-            cell.count(Counter::Sent, 1);
-        }
-        CommitOutcome::Deferred => cell.count(Counter::Deferred, 1),
-        CommitOutcome::Empty => {}
-    }
 }

@@ -133,7 +133,7 @@ impl Pair {
         let grid = Grid::axis_aligned([SIZE; 3], [1.0; 3]);
         let voxels = (0..grid.voxel_count()).map(|n| (n % 2003) as i16 - 1000).collect();
         let volume = Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels);
-        let sizes = StoreSizes { spare_slots: SPARE_SLOTS, displacement_slots: 0 };
+        let sizes = StoreSizes { spare_slots: SPARE_SLOTS, ..StoreSizes::default() };
         let store = StoreKeeper::create(&domain.0, &volume, sizes, |_| {})?;
         drop(volume);
         let node = Node::open(&domain.0, "latency")?;

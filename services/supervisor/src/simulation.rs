@@ -62,7 +62,7 @@ impl Drop for Files {
 pub fn plan_of(scene: &Scene, volume: &Volume) -> (Plan, StoreSizes) {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let plan = plan(scene, &volume.info.grid, Machine { cores });
-    let sizes = StoreSizes { spare_slots: plan.version_slots, displacement_slots: plan.displacement_slots };
+    let sizes = StoreSizes::by_segment(|segment| plan.slots(segment));
     (plan, sizes)
 }
 

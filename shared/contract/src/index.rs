@@ -9,26 +9,37 @@ use bytemuck::Zeroable;
 use core::sync::atomic::{AtomicU32, AtomicU64};
 
 /// "mailidx" and the version of this layout.
-pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx1");
+pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx2");
 /// Entries of a leaf page.
 pub const LEAF_LEN: usize = 64;
 /// Entry of something that does not exist.
 pub const ABSENT: u32 = u32::MAX;
 /// Bits of a head word that number the root page; the rest is the epoch.
 pub const ROOT_BITS: u32 = 16;
-/// Channels of a store.
-pub const CHANNELS: usize = 3;
+/// Channels of a store, present or not: one that the plan does not ask for has no entries, no slots and no segment.
+pub const CHANNELS: usize = 6;
 
-/// Channel numbers.
+/// Channel numbers. All but voxels and state hold bricks that are absent until they are first written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
 pub enum Channel {
     /// voxels: rest bricks are slots below `entry_count`, versions above
     Voxels = 0,
-    /// displacement bricks, absent where nothing ever moved
+    /// displacement of each element [mm, along the grid's axes], three planes of f32
     Displacement = 1,
     /// one small block of state
     State = 2,
+    /// the part of the displacement that does not go back when tissue relaxes [mm, along the grid's axes], three planes of f32
+    Plastic = 3,
+    /// links cut, a byte an element: bits 0, 1, 2 are the links to the next element along i, j, k
+    Cuts = 4,
+    /// labels, a byte a voxel
+    Labels = 5,
+}
+
+impl Channel {
+    /// All, in order of their numbers.
+    pub const ALL: [Self; CHANNELS] = [Self::Voxels, Self::Displacement, Self::State, Self::Plastic, Self::Cuts, Self::Labels];
 }
 
 /// What a channel holds.
@@ -78,8 +89,16 @@ pub struct IndexHeader {
     pub checksum: AtomicU64,
     /// the layout, word by word
     pub layout: [AtomicU64; size_of::<IndexLayout>() / 8],
+    /// the head
+    pub head: Head,
+}
+
+/// The head word with nothing beside it: readers load it at every snapshot and whenever they look for news. 128, because
+/// processors fetch lines in pairs.
+#[repr(C, align(128))]
+pub struct Head {
     /// epoch << [`ROOT_BITS`] | root page: the one word that makes a commit visible
-    pub head: AtomicU64,
+    pub word: AtomicU64,
 }
 
 /// Life of a slot or page: [born, superseded) in epochs.
@@ -91,6 +110,33 @@ pub struct SlotRecord {
     /// first epoch that no longer shows it; [`NEVER`] while it is current; 0 when free
     pub superseded: AtomicU64,
 }
+
+/// "mailreg" and the version of this layout.
+pub const REGION_MAGIC: u64 = u64::from_le_bytes(*b"mailreg1");
+/// Longest kind of a region, in bytes.
+pub const REGION_KIND_BYTES: usize = 64;
+
+/// Start of a read-only region: what is in it, and where. A header of the kind's own type follows at [`REGION_HEADER_OFFSET`], the body at
+/// `body_offset`.
+#[repr(C)]
+#[derive(Zeroable)]
+pub struct RegionHeader {
+    /// [`REGION_MAGIC`], stored last
+    pub magic: AtomicU64,
+    /// FNV-1a of the bytes of kind, the three numbers below and the kind's own header
+    pub checksum: AtomicU64,
+    /// name and version of what is in it, `maille.DisplacementField/v1`, padded with zeros
+    pub kind: [AtomicU64; REGION_KIND_BYTES / 8],
+    /// bytes of the kind's own header
+    pub header_bytes: AtomicU64,
+    /// from the start of the segment
+    pub body_offset: AtomicU64,
+    /// bytes of the body
+    pub body_bytes: AtomicU64,
+}
+
+/// Offset of the header of the region's kind.
+pub const REGION_HEADER_OFFSET: usize = 128;
 
 /// Not superseded.
 pub const NEVER: u64 = u64::MAX;

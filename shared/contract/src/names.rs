@@ -106,4 +106,12 @@ pub mod segment {
     pub const DISPLACEMENT: &str = "displacement";
     /// versions of the deformation's small state
     pub const STATE: &str = "state";
+    /// versions of the plastic part of displacements; written by the store's writer
+    pub const PLASTIC: &str = "plastic";
+    /// versions of cut links; written by the store's writer
+    pub const CUTS: &str = "cuts";
+    /// versions of labels; written by the store's writer
+    pub const LABELS: &str = "labels";
+    /// read-only regions, followed by the region's name; written once by the supervisor
+    pub const REGION: &str = "region-";
 }

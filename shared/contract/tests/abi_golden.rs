@@ -5,7 +5,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 use maille_contract::{
     Commit, ControlBlock, FrameHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState,
-    index::{ChannelLayout, IndexHeader, IndexLayout, SlotRecord},
+    index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
     probe::{Ping, Pong},
 };
@@ -55,6 +55,9 @@ fn shared_words_keep_their_sizes_and_offsets() {
     assert_eq!(offset_of!(ControlBlock, pins) % 64, 0);
     golden!(ChannelLayout, 24, entry_count: 0, slot_count: 8, slot_bytes: 16);
     golden!(SlotRecord, 16, born: 0, superseded: 8);
-    golden!(IndexLayout, 288, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 264, root_count: 272, leaf_count: 280);
-    golden!(IndexHeader, 24 + size_of::<IndexLayout>(), magic: 0, checksum: 8, layout: 16);
+    golden!(IndexLayout, 360, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 336, root_count: 344, leaf_count: 352);
+    assert_eq!((size_of::<IndexHeader>(), align_of::<IndexHeader>()), (512, 128));
+    assert_eq!((offset_of!(IndexHeader, magic), offset_of!(IndexHeader, checksum), offset_of!(IndexHeader, layout), offset_of!(IndexHeader, head)), (0, 8, 16, 384));
+    golden!(RegionHeader, 104, magic: 0, checksum: 8, kind: 16, header_bytes: 80, body_offset: 88, body_bytes: 96);
+    assert_eq!(Channel::ALL.map(|c| c as usize), [0, 1, 2, 3, 4, 5]);
 }

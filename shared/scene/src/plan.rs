@@ -131,6 +131,10 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
         segments.push(of_bricks("versions", "rewritten CT values", version_slots, &VOXELS));
         segments.push(of_bricks(DISPLACEMENT.name, DISPLACEMENT.meaning, displacement_slots, &DISPLACEMENT));
     }
+    // whatever else a commit rewrites follows the displacement
+    for channel in channels.iter().filter(|c| **c != &DISPLACEMENT) {
+        segments.push(of_bricks(channel.name, channel.meaning, if moves { displacement_slots } else { bricks }, channel));
+    }
 
     let knobs = KNOBS.iter().filter(|k| effects.iter().any(|e| e.name == k.effect)).map(|k| (k, (k.get)(scene))).collect();
     let panels = if scene.console.enabled { effects.iter().flat_map(|e| e.panels).copied().collect() } else { Vec::new() };
@@ -164,6 +168,11 @@ impl Plan {
     /// Whether an effect is active.
     pub fn has(&self, effect: &str) -> bool {
         self.effects.iter().any(|e| e.name == effect)
+    }
+
+    /// Slots of a segment in bricks; 0 where it is not in the plan.
+    pub fn slots(&self, segment: &str) -> usize {
+        self.segments.iter().find(|s| s.name == segment).map_or(0, |s| s.slots)
     }
 
     /// Whether displacements are stored.

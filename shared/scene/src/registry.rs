@@ -57,6 +57,15 @@ pub static DISPLACEMENT: Channel = Channel {
     brick_bytes: 3 * 4 * EDGE * EDGE * EDGE,
 };
 
+/// The part of the displacement that stays when tissue relaxes.
+pub static PLASTIC: Channel =
+    Channel { name: "plastic", meaning: "plastic part of the displacement [mm], 3 × f32", brick_bytes: DISPLACEMENT.brick_bytes };
+/// Cut links.
+pub static CUTS: Channel =
+    Channel { name: "cuts", meaning: "links that are cut, a bit for each of three a voxel", brick_bytes: EDGE * EDGE * EDGE };
+/// Labels.
+pub static LABELS: Channel = Channel { name: "labels", meaning: "a label for each voxel, u8", brick_bytes: EDGE * EDGE * EDGE };
+
 /// A piece of work that runs in a process, by construction of that process's pipeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stage {
@@ -219,7 +228,7 @@ pub static EFFECTS: &[Effect] = &[
         ..Effect::named("relaxation", "tissue creeps back towards rest while no tool touches it")
     },
     Effect::later("object-shape", "separate pieces collide instead of being linked", &["deformation"]),
-    Effect::later("cutting", "links are removed by a blade", &["deformation"]),
+    Effect { channels: &[&CUTS], ..Effect::later("cutting", "links are removed by a blade", &["deformation"]) },
     Effect::later("palpation", "several proxies feel a finger's area", &["contact"]),
     Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
@@ -227,7 +236,7 @@ pub static EFFECTS: &[Effect] = &[
     Effect::later("x-ray", "a fluoroscopic view", &[]),
     Effect::later("ultrasound", "an ultrasound view", &[]),
     Effect::later("surfaces", "meshes extracted live", &[]),
-    Effect::later("labels", "organs by label", &[]),
+    Effect { channels: &[&LABELS], ..Effect::later("labels", "organs by label", &[]) },
     Effect::later("recording", "a record that can be replayed", &[]),
 ];
 

@@ -3,7 +3,7 @@
 use crate::{
     Writer,
     transaction::Version,
-    writer::{KIND_NAMES, KINDS},
+    writer::{KINDS, kind_name},
 };
 
 /// What one kind of slot or page is used for.
@@ -22,7 +22,7 @@ pub struct Audit {
 }
 
 impl Writer {
-    /// Counts everything, kind by kind: slots of voxels, displacement and state, leaf pages, root pages. Slow; for tests.
+    /// Counts everything, kind by kind: slots of each channel, leaf pages, root pages. Slow; for tests.
     ///
     /// # Errors
     /// What is used twice or not at all.
@@ -49,7 +49,7 @@ impl Writer {
                 used[number as usize] += 1;
             }
             if let Some(number) = used.iter().position(|&n| n != 1) {
-                return Err(format!("number {number} of the {} is used {} times; {count:?}", KIND_NAMES[kind], used[number]));
+                return Err(format!("number {number} of the {} is used {} times; {count:?}", kind_name(kind), used[number]));
             }
         }
         Ok(counts)

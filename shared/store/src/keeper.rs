@@ -1,14 +1,15 @@
 //! Making a store: the supervisor's part.
 
 use crate::{
-    DISPLACEMENT_LEN, STATE_BYTES, StoreError, StoreSizes,
-    layout::{first_entry, index_layout},
+    StoreError, StoreSizes,
+    channel::SPECS,
+    layout::{first_entry, index_layout, segments},
     protocol::publish,
-    raw::{IndexMap, Slots},
+    raw::{IndexMap, RegionMap, Slots},
 };
-use maille_contract::index::{ABSENT, Channel, LEAF_LEN, NEVER};
+use maille_contract::index::{ABSENT, CHANNELS, Channel, LEAF_LEN, NEVER};
 use maille_contract::names::segment;
-use maille_transport::Domain;
+use maille_transport::{Domain, segment::free_shm_bytes};
 use maille_volume::{Brick, BrickId, BrickLayout, Volume, VolumeInfo, brick::fill_from_volume};
 use rayon::prelude::*;
 use std::sync::atomic::Ordering::Relaxed;
@@ -25,26 +26,16 @@ pub struct StorePlan {
 impl StorePlan {
     /// Bytes of each segment, by name.
     pub fn segments(&self) -> Vec<(&'static str, usize)> {
-        let l = index_layout(&self.info, self.sizes);
-        let bricks = l.channels[0].entry_count as usize;
-        let sizes = [
-            (segment::INDEX, crate::layout::IndexOffsets::new(&l).total),
-            (segment::REST, bricks * size_of::<Brick>()),
-            (segment::VERSIONS, self.sizes.spare_slots * size_of::<Brick>()),
-            (segment::DISPLACEMENT, self.sizes.displacement_slots * DISPLACEMENT_LEN * 4),
-            (segment::STATE, l.channels[2].slot_count as usize * STATE_BYTES),
-        ];
-        sizes.into_iter().filter(|(_, bytes)| *bytes > 0).collect()
+        segments(&index_layout(&self.info, self.sizes))
     }
 }
 
 /// The maker of a store. It keeps the segments mapped, so that their pages stay shared rather than private to one reader.
 pub struct StoreKeeper {
-    _index: IndexMap,
-    rest: Slots<Brick>,
-    _versions: Slots<Brick>,
-    _displacement: Slots<[f32; DISPLACEMENT_LEN]>,
-    _state: Slots<[u8; STATE_BYTES]>,
+    index: IndexMap,
+    rest: Slots,
+    _slots: [Slots; CHANNELS],
+    pub(crate) regions: Vec<RegionMap>,
 }
 
 impl StoreKeeper {
@@ -55,27 +46,33 @@ impl StoreKeeper {
     /// When shared memory cannot be had; the error says how much is needed.
     pub fn create(domain: &Domain, volume: &Volume, sizes: StoreSizes, progress: impl Fn(f64) + Sync) -> Result<Self, StoreError> {
         let layout = index_layout(&volume.info, sizes);
+        let needed = segments(&layout).iter().fold(0u64, |sum, &(_, bytes)| sum.saturating_add(bytes as u64));
+        let free = free_shm_bytes();
+        if needed > free {
+            return Err(StoreError::Room { needed_mib: needed.div_ceil(1 << 20), free_mib: free >> 20 });
+        }
         #[cfg(feature = "fault-points")]
         crate::raw::FaultMap::create(domain)?;
         let index = IndexMap::create(domain, layout)?;
         let bricks = BrickLayout::new(volume.info.grid.size);
-        let mut keeper = Self {
-            rest: Slots::create(domain, segment::REST, bricks.count())?,
-            _versions: Slots::create(domain, segment::VERSIONS, sizes.spare_slots)?,
-            _displacement: Slots::create(domain, segment::DISPLACEMENT, sizes.displacement_slots)?,
-            _state: Slots::create(domain, segment::STATE, layout.channels[2].slot_count as usize)?,
-            _index: index,
-        };
+        let rest = Slots::create(domain, segment::REST, bricks.count(), SPECS[0].slot_bytes)?;
+        let mut slots = Vec::with_capacity(CHANNELS);
+        for (n, (spec, channel)) in SPECS.iter().zip(&layout.channels).enumerate() {
+            let count = channel.slot_count as usize - if n == 0 { bricks.count() } else { 0 };
+            slots.push(Slots::create(domain, spec.segment, count, spec.slot_bytes)?);
+        }
+        let slots = slots.try_into().unwrap_or_else(|_| unreachable!("one for each channel"));
+        let mut keeper = Self { index, rest, _slots: slots, regions: Vec::new() };
         keeper.fill_rest(volume, &bricks, progress);
         keeper.first_index();
-        keeper._index.seal();
+        keeper.index.seal();
         Ok(keeper)
     }
 
     fn fill_rest(&mut self, volume: &Volume, bricks: &BrickLayout, progress: impl Fn(f64) + Sync) {
         const CHUNK: usize = 256;
         let (total, done) = (bricks.count(), std::sync::atomic::AtomicUsize::new(0));
-        self.rest.all_mut().par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, slots)| {
+        self.rest.all_mut::<Brick>().par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, slots)| {
             for (n, brick) in slots.iter_mut().enumerate() {
                 fill_from_volume(volume, bricks, (chunk * CHUNK + n) as BrickId, brick);
             }
@@ -83,10 +80,9 @@ impl StoreKeeper {
         });
     }
 
-    /// Root page 0 and leaves 0.. point every voxel entry at its rest slot, no displacement entry anywhere, and the state at
-    /// slot 0.
+    /// Root page 0 and leaves 0.. point every voxel entry at its rest slot, the state at slot 0, and no other entry anywhere.
     fn first_index(&self) {
-        let index = &self._index;
+        let index = &self.index;
         let l = &index.layout;
         let voxels = l.channels[0].entry_count as usize;
         let state = first_entry(l, Channel::State);

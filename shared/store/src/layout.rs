@@ -1,11 +1,10 @@
 //! Sizes and offsets of the store's segments, computed alike by whoever makes and whoever opens it.
 
-use crate::StoreError;
-use maille_contract::index::{ABSENT, Channel, ChannelLayout, IndexHeader, IndexLayout, LEAF_LEN, ROOT_BITS, SlotRecord};
-use maille_volume::{Brick, BrickLayout, Grid, Rescale, VolumeInfo, brick};
+use crate::{StoreError, channel::SPECS};
+use maille_contract::index::{ABSENT, CHANNELS, Channel, ChannelLayout, IndexHeader, IndexLayout, LEAF_LEN, ROOT_BITS, SlotRecord};
+use maille_contract::names::segment;
+use maille_volume::{BrickLayout, Grid, Rescale, VolumeInfo, brick};
 
-/// Numbers of a displacement brick: three components, each EDGE³ voxels, i fastest.
-pub const DISPLACEMENT_LEN: usize = 3 * brick::EDGE * brick::EDGE * brick::EDGE;
 /// Bytes of the state block.
 pub const STATE_BYTES: usize = 4096;
 /// Versions of the state block.
@@ -13,13 +12,19 @@ const STATE_SLOTS: u64 = 64;
 /// Pages for one leaf each of as many epochs as there may be pins and more.
 const SPARE_ROOTS: u64 = 64;
 
-/// How much of what a store has.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// How much of what a store has. A channel of 0 slots does not exist.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StoreSizes {
     /// voxel slots beside the rest bricks
     pub spare_slots: usize,
     /// displacement slots; 0 where no effect moves anything
     pub displacement_slots: usize,
+    /// slots of the displacement's plastic part
+    pub plastic_slots: usize,
+    /// slots of cut links
+    pub cut_slots: usize,
+    /// slots of labels
+    pub label_slots: usize,
 }
 
 impl StoreSizes {
@@ -28,18 +33,45 @@ impl StoreSizes {
     /// of the dirty set.
     pub fn for_volume(bricks: usize, dirty: usize, readers: usize, displacement: bool) -> Self {
         let spare_slots = bricks + (readers + 1) * dirty.min(bricks);
-        Self { spare_slots, displacement_slots: if displacement { bricks + 2 * dirty.min(bricks) } else { 0 } }
+        let displacement_slots = if displacement { bricks + 2 * dirty.min(bricks) } else { 0 };
+        Self { spare_slots, displacement_slots, ..Self::default() }
+    }
+
+    /// Slots as a plan has them, by name of the segment that holds them.
+    pub fn by_segment(slots: impl Fn(&str) -> usize) -> Self {
+        Self {
+            spare_slots: slots(segment::VERSIONS),
+            displacement_slots: slots(segment::DISPLACEMENT),
+            plastic_slots: slots(segment::PLASTIC),
+            cut_slots: slots(segment::CUTS),
+            label_slots: slots(segment::LABELS),
+        }
+    }
+
+    /// Slots of a channel, rest bricks not counted.
+    fn of(&self, channel: Channel) -> usize {
+        match channel {
+            Channel::Voxels => self.spare_slots,
+            Channel::Displacement => self.displacement_slots,
+            Channel::State => STATE_SLOTS as usize,
+            Channel::Plastic => self.plastic_slots,
+            Channel::Cuts => self.cut_slots,
+            Channel::Labels => self.label_slots,
+        }
     }
 }
 
 pub(crate) fn index_layout(info: &VolumeInfo, sizes: StoreSizes) -> IndexLayout {
     let bricks = BrickLayout::new(info.grid.size).count() as u64;
-    let channel = |entry_count, slot_count, slot_bytes: usize| ChannelLayout { entry_count, slot_count, slot_bytes: slot_bytes as u64 };
-    let channels = [
-        channel(bricks, bricks + sizes.spare_slots as u64, size_of::<Brick>()),
-        channel(if sizes.displacement_slots > 0 { bricks } else { 0 }, sizes.displacement_slots as u64, DISPLACEMENT_LEN * 4),
-        channel(1, STATE_SLOTS, STATE_BYTES),
-    ];
+    let channels = Channel::ALL.map(|channel| {
+        let slots = sizes.of(channel) as u64;
+        let (entry_count, slot_count) = match channel {
+            Channel::Voxels => (bricks, bricks + slots),
+            Channel::State => (1, slots),
+            _ => (if slots > 0 { bricks } else { 0 }, slots),
+        };
+        ChannelLayout { entry_count, slot_count, slot_bytes: SPECS[channel as usize].slot_bytes as u64 }
+    });
     let entries: u64 = channels.iter().map(|c| c.entry_count).sum();
     let leaves = entries.div_ceil(LEAF_LEN as u64);
     IndexLayout {
@@ -61,7 +93,7 @@ pub(crate) fn index_layout(info: &VolumeInfo, sizes: StoreSizes) -> IndexLayout 
 pub(crate) struct IndexOffsets {
     pub roots: usize,
     pub leaves: usize,
-    pub records: [usize; 3],
+    pub records: [usize; CHANNELS],
     pub leaf_records: usize,
     pub root_records: usize,
     pub total: usize,
@@ -89,15 +121,28 @@ pub(crate) fn first_entry(l: &IndexLayout, channel: Channel) -> usize {
     l.channels[..channel as usize].iter().map(|c| c.entry_count as usize).sum()
 }
 
+/// Bytes of each segment, by name, read-only regions not among them.
+pub(crate) fn segments(l: &IndexLayout) -> Vec<(&'static str, usize)> {
+    let bricks = l.channels[0].entry_count as usize;
+    let mut segments = vec![(segment::INDEX, IndexOffsets::new(l).total), (segment::REST, bricks * SPECS[0].slot_bytes)];
+    for (channel, (spec, c)) in SPECS.iter().zip(&l.channels).enumerate() {
+        let slots = c.slot_count as usize - if channel == 0 { bricks } else { 0 };
+        if slots > 0 {
+            segments.push((spec.segment, slots.saturating_mul(spec.slot_bytes)));
+        }
+    }
+    segments
+}
+
 /// FNV-1a, 64 bits.
-pub(crate) fn checksum(l: &IndexLayout) -> u64 {
-    bytemuck::bytes_of(l).iter().fold(0xCBF2_9CE4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01B3))
+pub(crate) fn checksum(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xCBF2_9CE4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01B3))
 }
 
 /// The layout, if this program can work with it.
 pub(crate) fn checked(l: IndexLayout, sum: u64) -> Result<(IndexLayout, VolumeInfo, BrickLayout), StoreError> {
     let fail = |reason: String| Err(StoreError::Index { reason });
-    if checksum(&l) != sum {
+    if checksum(bytemuck::bytes_of(&l)) != sum {
         return fail("the layout's checksum is wrong".into());
     }
     if l.brick != [brick::EDGE as u64, brick::APRON_LOW as u64, brick::APRON_HIGH as u64, 0] {
@@ -109,23 +154,27 @@ pub(crate) fn checked(l: IndexLayout, sum: u64) -> Result<(IndexLayout, VolumeIn
     }
     let info = VolumeInfo { grid, rescale: Rescale { slope: l.rescale[0], intercept: l.rescale[1] } };
     let bricks = BrickLayout::new(info.grid.size);
-    let [voxels, displacement, state] = l.channels;
-    let sizes = [voxels.slot_bytes, displacement.slot_bytes, state.slot_bytes];
-    if sizes != [size_of::<Brick>() as u64, DISPLACEMENT_LEN as u64 * 4, STATE_BYTES as u64] || voxels.entry_count != bricks.count() as u64
-    {
-        return fail("the channels have other sizes".into());
+    let count = bricks.count() as u64;
+    for (channel, c) in Channel::ALL.into_iter().zip(&l.channels) {
+        let spec = &SPECS[channel as usize];
+        if c.slot_bytes != spec.slot_bytes as u64 {
+            return fail(format!("{} of {} bytes instead of {}", spec.slots, c.slot_bytes, spec.slot_bytes));
+        }
+        let entries_fit = match channel {
+            Channel::Voxels => c.entry_count == count && c.slot_count >= count,
+            Channel::State => c.entry_count == 1 && c.slot_count >= 1,
+            _ => [0, count].contains(&c.entry_count) && (c.slot_count > 0) == (c.entry_count > 0),
+        };
+        if !entries_fit || c.slot_count >= u64::from(ABSENT) {
+            return fail(format!("{} entries for {count} bricks in {} {}", c.entry_count, c.slot_count, spec.slots));
+        }
     }
-    let entries: u64 = [voxels, displacement, state].iter().map(|c| c.entry_count).sum();
-    if voxels.slot_count < voxels.entry_count
-        || ![0, voxels.entry_count].contains(&displacement.entry_count)
-        || state.entry_count != 1
-        || [voxels, displacement, state].iter().any(|c| c.slot_count >= u64::from(ABSENT))
-        || l.root_len != entries.div_ceil(LEAF_LEN as u64)
-    {
-        return fail("the channels have other counts".into());
+    let entries: u64 = l.channels.iter().map(|c| c.entry_count).sum();
+    if l.root_len != entries.div_ceil(LEAF_LEN as u64) {
+        return fail(format!("root pages of {} words for {entries} entries", l.root_len));
     }
-    if l.root_count >= 1 << ROOT_BITS || l.leaf_count >= 1 << 31 || l.root_len >= 1 << 31 {
-        return fail("too many index pages".into());
+    if !(1..1 << ROOT_BITS).contains(&l.root_count) || !(l.root_len..1 << 31).contains(&l.leaf_count) {
+        return fail(format!("{} root pages and {} leaf pages", l.root_count, l.leaf_count));
     }
     Ok((l, info, bricks))
 }

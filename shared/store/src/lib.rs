@@ -11,7 +11,8 @@
 //! - `reader.snapshot()` is wait-free: a handful of steps, whatever the writer does. `snapshot.brick(id)` is a reference into
 //!   shared memory, never a copy.
 //! - A reader that is stopped, anywhere, costs at most one version of each brick; the writer never waits for it.
-//! - No free slot (a slow or stopped reader)? The commit is put off and merged into the next one; the writer goes on.
+//! - No free slot (a slow or stopped reader)? The commit is put off and merged into the next one, or published by
+//!   [`Writer::publish_deferred`] as soon as there is room; the writer goes on.
 //! - The committed store is the recovery: [`Writer::open`] finds exactly the last commit, whatever its predecessor was doing.
 //!
 //! # The protocol's one race, and why it is none
@@ -19,14 +20,16 @@
 //! argument; `tests/model.rs` checks them under loom, `tests/kills.rs` with processes that die in the middle of them.
 //!
 //! # Layout
-//! Five segments (DESIGN D12): the index, rest bricks, brick versions, displacement, state. The first index points at the rest
-//! bricks; what never changes exists once. Units and frame are those of `maille-volume`.
+//! Segments (DESIGN D12): the index, rest bricks, brick versions, state, and one for each channel that the plan asks for
+//! ([`Displacement`], [`Plastic`], [`Cuts`], [`Labels`]). The first index points at the rest bricks; what never changes
+//! exists once. What else never changes is a [`Region`]. Units and frame are those of `maille-volume`.
 //!
 //! Not here: who may start when (the supervisor), what a brick means (the mapper, the ray caster).
 
 #![deny(unsafe_code)]
 
 mod audit;
+mod channel;
 #[cfg_attr(not(feature = "fault-points"), allow(dead_code))]
 #[doc(hidden)]
 pub mod fault;
@@ -38,14 +41,16 @@ mod publish;
 mod raw;
 mod reader;
 mod recover;
+mod region;
 mod transaction;
 mod writer;
 
 pub use audit::Audit;
-
+pub use channel::{BRICK_VOXELS, BrickChannel, Cuts, DISPLACEMENT_LEN, Displacement, Labels, Plastic};
 pub use keeper::{StoreKeeper, StorePlan};
-pub use layout::{DISPLACEMENT_LEN, STATE_BYTES, StoreSizes};
+pub use layout::{STATE_BYTES, StoreSizes};
 pub use reader::{Reader, RestBricks, Snapshot, volume_info};
+pub use region::Region;
 pub use transaction::{CommitOutcome, Transaction};
 pub use writer::Writer;
 
@@ -65,6 +70,13 @@ pub enum StoreError {
         "the store's index is not what this program expects ({reason}); it was made by another version or is damaged: run `maille clean`"
     )]
     Index { reason: String },
+    #[error(
+        "/dev/shm has not enough room: the store needs {needed_mib} MiB and {free_mib} MiB are free; enlarge it \
+         (`mount -o remount,size=8G /dev/shm`, or `docker run --shm-size=8g`) or take a smaller volume"
+    )]
+    Room { needed_mib: u64, free_mib: u64 },
+    #[error("the read-only region `{name}` cannot be used: {reason}")]
+    Region { name: String, reason: String },
     #[error(
         "the store's segment `{segment}` has {found} bytes instead of {expected}: it is truncated or of another version; run `maille clean`"
     )]

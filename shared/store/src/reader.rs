@@ -1,14 +1,16 @@
 //! Reading: pin, follow the pinned root, let go.
 
 use crate::{
-    DISPLACEMENT_LEN, STATE_BYTES, StoreError,
+    BrickChannel, DISPLACEMENT_LEN, Displacement, STATE_BYTES, StoreError,
+    channel::SPECS,
     fault::{Point, point},
     layout::first_entry,
     protocol::{Step, epoch_of, pin, root_of, unpin},
     raw::{IndexMap, Slots},
+    writer::open_slots,
 };
 use maille_contract::control::{PINS, Pin};
-use maille_contract::index::{ABSENT, Channel, LEAF_LEN};
+use maille_contract::index::{ABSENT, CHANNELS, Channel, LEAF_LEN};
 use maille_contract::names::segment;
 use maille_contract::{ControlBlock, Role};
 use maille_transport::{Access, ControlMap, Domain};
@@ -24,13 +26,11 @@ pub struct Reader {
     index: IndexMap,
     info: VolumeInfo,
     layout: BrickLayout,
-    rest: Slots<Brick>,
-    versions: Slots<Brick>,
-    displacement: Slots<[f32; DISPLACEMENT_LEN]>,
-    state: Slots<[u8; STATE_BYTES]>,
+    rest: Slots,
+    /// by channel; of voxels the versions, whose numbers follow those of the rest bricks
+    slots: [Slots; CHANNELS],
+    first: [usize; CHANNELS],
     pins: Range<usize>,
-    first_displacement: usize,
-    first_state: usize,
 }
 
 /// Grid and rescale of a domain's volume, without mapping its voxels.
@@ -66,15 +66,10 @@ impl Reader {
         crate::fault::arm(domain, None);
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::Read)?;
-        let [voxels, displacement, state] = index.layout.channels;
-        let spare = (voxels.slot_count - voxels.entry_count) as usize;
         Ok(Self {
-            first_displacement: first_entry(&index.layout, Channel::Displacement),
-            first_state: first_entry(&index.layout, Channel::State),
-            rest: Slots::open(domain, segment::REST, layout.count(), Access::Read, true)?,
-            versions: Slots::open(domain, segment::VERSIONS, spare, Access::Read, true)?,
-            displacement: Slots::open(domain, segment::DISPLACEMENT, displacement.slot_count as usize, Access::Read, false)?,
-            state: Slots::open(domain, segment::STATE, state.slot_count as usize, Access::Read, true)?,
+            rest: Slots::open(domain, segment::REST, layout.count(), SPECS[0].slot_bytes, Access::Read, true)?,
+            slots: open_slots(domain, &index, Access::Read, true)?,
+            first: Channel::ALL.map(|c| first_entry(&index.layout, c)),
             control,
             index,
             info,
@@ -123,7 +118,7 @@ impl Reader {
 
     /// Address ranges of the mapped voxels (rest, versions): what a reader dereferences lies inside.
     pub fn voxel_addresses(&self) -> [Range<usize>; 2] {
-        [self.rest.addresses(), self.versions.addresses()]
+        [self.rest.addresses(), self.slots[0].addresses()]
     }
 }
 
@@ -148,19 +143,30 @@ impl Snapshot<'_> {
         index.leaf(leaf as usize)[entry % LEAF_LEN].load(Relaxed)
     }
 
-    /// Displacement [mm, along the grid's axes] of a brick's voxels, component after component; `None` where nothing moved.
-    pub fn displacement(&self, id: BrickId) -> Option<&[f32; DISPLACEMENT_LEN]> {
-        if self.reader.index.layout.channels[Channel::Displacement as usize].entry_count == 0 {
+    /// What a channel holds for a brick; `None` where nothing was ever written, or without that channel.
+    ///
+    /// # Panics
+    /// When there is no such brick.
+    #[inline]
+    pub fn channel<C: BrickChannel>(&self, id: BrickId) -> Option<&C::Data> {
+        let (channel, count) = (C::CHANNEL as usize, self.reader.layout.count());
+        assert!((id as usize) < count, "brick {id} of {count}");
+        if self.reader.index.layout.channels[channel].entry_count == 0 {
             return None;
         }
-        assert!((id as usize) < self.reader.layout.count(), "brick {id} of {}", self.reader.layout.count());
-        let slot = self.slot(self.reader.first_displacement + id as usize);
-        (slot != ABSENT).then(|| self.reader.displacement.get(slot as usize))
+        let slot = self.slot(self.reader.first[channel] + id as usize);
+        (slot != ABSENT).then(|| self.reader.slots[channel].get(slot as usize))
+    }
+
+    /// Displacement [mm, along the grid's axes] of a brick's voxels, component after component; `None` where nothing moved.
+    pub fn displacement(&self, id: BrickId) -> Option<&[f32; DISPLACEMENT_LEN]> {
+        self.channel::<Displacement>(id)
     }
 
     /// The deformation process's small state, as the last commit left it.
     pub fn state(&self) -> &[u8; STATE_BYTES] {
-        self.reader.state.get(self.slot(self.reader.first_state) as usize)
+        const STATE: usize = Channel::State as usize;
+        self.reader.slots[STATE].get(self.slot(self.reader.first[STATE]) as usize)
     }
 }
 
@@ -176,7 +182,7 @@ impl BrickSource for Snapshot<'_> {
         let count = self.reader.layout.count();
         assert!((id as usize) < count, "brick {id} of {count}");
         let slot = self.slot(id as usize) as usize;
-        if slot < count { self.reader.rest.get(slot) } else { self.reader.versions.get(slot - count) }
+        if slot < count { self.reader.rest.get(slot) } else { self.reader.slots[0].get(slot - count) }
     }
     #[inline]
     fn stamp(&self, id: BrickId) -> u64 {
@@ -198,7 +204,7 @@ impl Drop for Snapshot<'_> {
 pub struct RestBricks<'a> {
     pub(crate) info: &'a VolumeInfo,
     pub(crate) layout: &'a BrickLayout,
-    pub(crate) rest: &'a Slots<Brick>,
+    pub(crate) rest: &'a Slots,
 }
 
 impl BrickSource for RestBricks<'_> {

@@ -7,7 +7,7 @@ use crate::{
     StoreError, Writer,
     fault::{Broken, Point, broken, point},
     protocol::{Fate, fate, root_of},
-    writer::{KIND_NAMES, KINDS, LEAVES, ROOTS, Retired},
+    writer::{KINDS, LEAVES, ROOTS, Retired, kind_name},
 };
 use maille_contract::index::{ABSENT, LEAF_LEN, NEVER};
 use std::sync::atomic::Ordering::Relaxed;
@@ -16,7 +16,11 @@ impl Writer {
     /// How many of each kind there are.
     pub(crate) fn totals(&self) -> [usize; KINDS] {
         let l = &self.index.layout;
-        [l.channels[0].slot_count, l.channels[1].slot_count, l.channels[2].slot_count, l.leaf_count, l.root_count].map(|n| n as usize)
+        std::array::from_fn(|kind| match kind {
+            LEAVES => l.leaf_count as usize,
+            ROOTS => l.root_count as usize,
+            channel => l.channels[channel].slot_count as usize,
+        })
     }
 
     /// Marks what the head's root reaches, and the rest bricks.
@@ -33,7 +37,7 @@ impl Writer {
             }
             found => {
                 let what = if found.is_some() { "named twice" } else { "named, but there is none" };
-                Err(StoreError::Index { reason: format!("number {number} of the {} is {what}", KIND_NAMES[kind]) })
+                Err(StoreError::Index { reason: format!("number {number} of the {} is {what}", kind_name(kind)) })
             }
         };
         let root = root_of(self.index.head().load(Relaxed));

@@ -1,11 +1,11 @@
 //! Changes that become visible together, or not at all.
 
 use crate::{
-    DISPLACEMENT_LEN, RestBricks, STATE_BYTES, Writer,
+    BrickChannel, DISPLACEMENT_LEN, Displacement, RestBricks, STATE_BYTES, Writer,
     fault::{Broken, Point, broken, point},
 };
 use bytemuck::Pod;
-use maille_contract::index::ABSENT;
+use maille_contract::index::{ABSENT, CHANNELS, Channel};
 use maille_volume::{Brick, BrickId};
 
 /// A new version of an entry.
@@ -56,7 +56,7 @@ impl<'w> Transaction<'w> {
     /// When there is no such brick.
     pub fn brick_mut(&mut self, id: BrickId) -> &mut Brick {
         assert!((id as usize) < self.writer.layout.count(), "brick {id} of {}", self.writer.layout.count());
-        self.edit::<Brick>(0, id as usize)
+        self.edit(0, id as usize)
     }
 
     /// A brick as readers would see it if this were committed now.
@@ -79,19 +79,28 @@ impl<'w> Transaction<'w> {
         })
     }
 
+    /// A private new version of what a channel holds for a brick; at first the current one, or zeros.
+    ///
+    /// # Panics
+    /// When there is no such brick, or the plan did not ask for the channel.
+    pub fn channel_mut<C: BrickChannel>(&mut self, id: BrickId) -> &mut C::Data {
+        let channel = C::CHANNEL as usize;
+        let entries = self.writer.index.layout.channels[channel].entry_count;
+        assert!(u64::from(id) < entries, "{:?} of brick {id} of {entries}", C::CHANNEL);
+        self.edit(channel, id as usize)
+    }
+
     /// A private new version of a brick's displacement; at first the current one, or zero.
     ///
     /// # Panics
     /// When there is no such brick, or the store has no displacement channel.
     pub fn displacement_mut(&mut self, id: BrickId) -> &mut [f32; DISPLACEMENT_LEN] {
-        let entries = self.writer.index.layout.channels[1].entry_count;
-        assert!(u64::from(id) < entries, "displacement brick {id} of {entries}");
-        self.edit::<[f32; DISPLACEMENT_LEN]>(1, id as usize)
+        self.channel_mut::<Displacement>(id)
     }
 
     /// A private new version of the state; at first the current one.
     pub fn state_mut(&mut self) -> &mut [u8; STATE_BYTES] {
-        self.edit::<[u8; STATE_BYTES]>(2, 0)
+        self.edit(Channel::State as usize, 0)
     }
 
     /// The volume at rest, for the mapper.
@@ -159,7 +168,7 @@ impl<'w> Transaction<'w> {
     /// commit; nothing is lost and nobody waits.
     pub fn commit(mut self) -> CommitOutcome {
         point(Point::Committing);
-        let mut changed = [0; 3];
+        let mut changed = [0; CHANNELS];
         self.edits.iter().for_each(|e| changed[e.channel] += 1);
         self.writer.largest = std::array::from_fn(|c| changed[c].max(self.writer.largest[c]));
         // what was put off before joins, unless it was changed again

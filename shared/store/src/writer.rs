@@ -1,24 +1,33 @@
 //! The writer: what it holds, and what it knows of the committed state.
 
 use crate::{
-    DISPLACEMENT_LEN, RestBricks, STATE_BYTES, StoreError, Transaction,
+    BrickChannel, DISPLACEMENT_LEN, Displacement, RestBricks, STATE_BYTES, StoreError, Transaction,
+    channel::SPECS,
     layout::first_entry,
     protocol::{epoch_of, root_of},
     raw::{IndexMap, Slots},
     transaction::{CommitOutcome, Edit, Version},
 };
 use maille_contract::ControlBlock;
-use maille_contract::index::{ABSENT, Channel, LEAF_LEN, SlotRecord};
+use maille_contract::index::{ABSENT, CHANNELS, Channel, LEAF_LEN, SlotRecord};
 use maille_contract::names::segment;
 use maille_transport::{Access, ControlMap, Domain};
-use maille_volume::{Brick, BrickId, BrickLayout, VolumeInfo};
+use maille_volume::{BrickId, BrickLayout, VolumeInfo};
 use std::sync::atomic::Ordering::Relaxed;
 
-/// What lives for a number of epochs: slots of the three channels, leaf pages, root pages.
-pub(crate) const KINDS: usize = 5;
-pub(crate) const LEAVES: usize = 3;
-pub(crate) const ROOTS: usize = 4;
-pub(crate) const KIND_NAMES: [&str; KINDS] = ["voxel slots", "displacement slots", "state slots", "leaf pages", "root pages"];
+/// What lives for a number of epochs: slots of the channels, by their numbers, leaf pages, root pages.
+pub(crate) const KINDS: usize = CHANNELS + 2;
+pub(crate) const LEAVES: usize = CHANNELS;
+pub(crate) const ROOTS: usize = CHANNELS + 1;
+
+/// What a kind is called in sentences.
+pub(crate) fn kind_name(kind: usize) -> &'static str {
+    match kind {
+        LEAVES => "leaf pages",
+        ROOTS => "root pages",
+        channel => SPECS[channel].slots,
+    }
+}
 
 /// Something superseded that a pin may still show.
 pub(crate) struct Retired {
@@ -41,10 +50,9 @@ pub struct Writer {
     pub(crate) index: IndexMap,
     info: VolumeInfo,
     pub(crate) layout: BrickLayout,
-    pub(crate) rest: Slots<Brick>,
-    pub(crate) versions: Slots<Brick>,
-    pub(crate) displacement: Slots<[f32; DISPLACEMENT_LEN]>,
-    pub(crate) state: Slots<[u8; STATE_BYTES]>,
+    pub(crate) rest: Slots,
+    /// by channel; of voxels the versions, whose numbers follow those of the rest bricks
+    slots: [Slots; CHANNELS],
     /// free slots and pages, by kind
     pub(crate) free: [Vec<u32>; KINDS],
     pub(crate) retired: Vec<Retired>,
@@ -55,9 +63,9 @@ pub struct Writer {
     /// memory of the next transaction's edits and of the next commit's changes, kept to be used again
     pub(crate) spare_edits: Vec<Edit>,
     pub(crate) changes: Vec<Change>,
-    pub(crate) first: [usize; 3],
+    pub(crate) first: [usize; CHANNELS],
     /// most entries of each channel that one transaction has changed so far
-    pub(crate) largest: [usize; 3],
+    pub(crate) largest: [usize; CHANNELS],
 }
 
 impl Writer {
@@ -71,16 +79,11 @@ impl Writer {
         crate::fault::arm(domain, Some(maille_contract::Role::Deformation));
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::ReadWrite)?;
-        let channels = index.layout.channels;
-        let [voxels, displacement, state] = channels.map(|c| c.slot_count as usize);
-        let spare = voxels - channels[0].entry_count as usize;
-        let entries: u64 = channels.iter().map(|c| c.entry_count).sum();
+        let entries: u64 = index.layout.channels.iter().map(|c| c.entry_count).sum();
         let mut writer = Self {
-            rest: Slots::open(domain, segment::REST, layout.count(), Access::Read, true)?,
-            versions: Slots::open(domain, segment::VERSIONS, spare, Access::ReadWrite, false)?,
-            displacement: Slots::open(domain, segment::DISPLACEMENT, displacement, Access::ReadWrite, false)?,
-            state: Slots::open(domain, segment::STATE, state, Access::ReadWrite, false)?,
-            first: [Channel::Voxels, Channel::Displacement, Channel::State].map(|c| first_entry(&index.layout, c)),
+            rest: Slots::open(domain, segment::REST, layout.count(), SPECS[0].slot_bytes, Access::Read, true)?,
+            slots: open_slots(domain, &index, Access::ReadWrite, false)?,
+            first: Channel::ALL.map(|c| first_entry(&index.layout, c)),
             control,
             index,
             info,
@@ -91,7 +94,7 @@ impl Writer {
             place: vec![0; entries as usize],
             spare_edits: Vec::new(),
             changes: Vec::new(),
-            largest: [0; 3],
+            largest: [0; CHANNELS],
         };
         writer.recover()?;
         Ok(writer)
@@ -132,40 +135,65 @@ impl Writer {
         !self.deferred.is_empty()
     }
 
-    /// Committed displacement of a brick; `None` where nothing moved.
-    pub fn displacement(&self, id: BrickId) -> Option<&[f32; DISPLACEMENT_LEN]> {
-        if self.index.layout.channels[1].entry_count == 0 {
+    /// What a channel holds for a brick, as last published; `None` where nothing was ever written, or without that channel.
+    ///
+    /// # Panics
+    /// When there is no such brick.
+    pub fn channel<C: BrickChannel>(&self, id: BrickId) -> Option<&C::Data> {
+        let channel = C::CHANNEL as usize;
+        assert!((id as usize) < self.layout.count(), "brick {id} of {}", self.layout.count());
+        if self.index.layout.channels[channel].entry_count == 0 {
             return None;
         }
-        assert!((id as usize) < self.layout.count(), "brick {id} of {}", self.layout.count());
-        let slot = self.published(self.first[1] + id as usize);
-        (slot != ABSENT).then(|| self.displacement.get(slot as usize))
+        let slot = self.published(self.first[channel] + id as usize);
+        (slot != ABSENT).then(|| self.slots[channel].get(slot as usize))
+    }
+
+    /// Committed displacement of a brick; `None` where nothing moved.
+    pub fn displacement(&self, id: BrickId) -> Option<&[f32; DISPLACEMENT_LEN]> {
+        self.channel::<Displacement>(id)
+    }
+
+    /// Whether the plan asked for a channel.
+    pub fn has_channel(&self, channel: Channel) -> bool {
+        self.index.layout.channels[channel as usize].entry_count > 0
     }
 
     /// The committed state.
     pub fn state(&self) -> &[u8; STATE_BYTES] {
-        self.state.get(self.published(self.first[2]) as usize)
+        const STATE: usize = Channel::State as usize;
+        self.slots[STATE].get(self.published(self.first[STATE]) as usize)
     }
 
-    /// Publishes what was put off, if that can be done now, and says whether another transaction may be begun. `false` while so
-    /// much waits that with one more like the largest so far it might never find room, not even when all readers let go: then
-    /// the caller does something else and asks again. A caller that never asks loses nothing, but may stay invisible.
-    pub fn has_room(&mut self) -> bool {
-        if self.deferred.is_empty() || matches!(self.begin().commit(), CommitOutcome::Published { .. }) {
-            return true;
+    /// Publishes what was put off, if that can be done now: the epoch that shows it. The caller says so to whom it tells of
+    /// commits.
+    pub fn publish_deferred(&mut self) -> Option<u64> {
+        if self.deferred.is_empty() {
+            return None;
         }
-        (0..3).all(|channel| {
-            let rest = if channel == 0 { self.layout.count() } else { 0 };
-            let slots = self.index.layout.channels[channel].slot_count as usize - rest;
-            let (mut waiting, mut in_slots) = (0, 0);
-            for edit in self.deferred.iter().filter(|e| e.channel == channel) {
-                waiting += 1;
-                in_slots += usize::from(matches!(edit.version, Version::Slot(_)));
-            }
-            let retired = self.retired.iter().filter(|r| r.kind == channel).count();
-            let shown = slots - self.free[channel].len() - retired - in_slots;
-            shown + waiting + self.largest[channel] <= slots
-        })
+        match self.begin().commit() {
+            CommitOutcome::Published { epoch, .. } => Some(epoch),
+            CommitOutcome::Deferred | CommitOutcome::Empty => None,
+        }
+    }
+
+    /// Whether another transaction may be begun. `false` while so much waits to be published that with one more like the largest
+    /// so far it might never find room, not even when all readers let go: then the caller does something else, publishes
+    /// what was put off when it can, and asks again. A caller that never asks loses nothing, but may stay invisible.
+    pub fn has_room(&self) -> bool {
+        self.deferred.is_empty()
+            || (0..CHANNELS).all(|channel| {
+                let rest = if channel == 0 { self.layout.count() } else { 0 };
+                let slots = self.index.layout.channels[channel].slot_count as usize - rest;
+                let (mut waiting, mut in_slots) = (0, 0);
+                for edit in self.deferred.iter().filter(|e| e.channel == channel) {
+                    waiting += 1;
+                    in_slots += usize::from(matches!(edit.version, Version::Slot(_)));
+                }
+                let retired = self.retired.iter().filter(|r| r.kind == channel).count();
+                let shown = slots - self.free[channel].len() - retired - in_slots;
+                shown + waiting + self.largest[channel] <= slots
+            })
     }
 
     /// Starts a transaction.
@@ -193,40 +221,45 @@ impl Writer {
     }
 
     pub(crate) fn channel_of(&self, entry: usize) -> usize {
-        (0..3).rev().find(|&c| entry >= self.first[c] && self.index.layout.channels[c].entry_count > 0).expect("entries start at 0")
+        let holds = |&c: &usize| entry >= self.first[c] && self.index.layout.channels[c].entry_count > 0;
+        (0..CHANNELS).rev().find(holds).expect("entries start at 0")
     }
 
     pub(crate) fn slot_bytes(&self, channel: usize, slot: u32) -> &[u8] {
         let rest = self.layout.count();
         match (channel, slot as usize) {
-            (0, slot) if slot < rest => bytemuck::bytes_of(self.rest.get(slot)),
-            (0, slot) => bytemuck::bytes_of(self.versions.get(slot - rest)),
-            (1, slot) => bytemuck::cast_slice(self.displacement.get(slot)),
-            (_, slot) => self.state.get(slot),
+            (0, slot) if slot < rest => self.rest.bytes(slot),
+            (0, slot) => self.slots[0].bytes(slot - rest),
+            (_, slot) => self.slots[channel].bytes(slot),
         }
     }
 
     pub(crate) fn slot_bytes_mut(&mut self, channel: usize, slot: u32) -> &mut [u8] {
-        let rest = self.layout.count();
-        match (channel, slot as usize) {
-            (0, slot) => bytemuck::bytes_of_mut(self.versions.get_mut(slot - rest)),
-            (1, slot) => bytemuck::cast_slice_mut(self.displacement.get_mut(slot)),
-            (_, slot) => self.state.get_mut(slot),
-        }
+        let rest = if channel == 0 { self.layout.count() } else { 0 };
+        self.slots[channel].bytes_mut(slot as usize - rest)
     }
 
     /// Copies a version into a free slot of its channel, inside shared memory.
     pub(crate) fn copy_slot(&mut self, channel: usize, from: u32, to: u32) {
-        let rest = self.layout.count();
-        match (channel, from as usize, to as usize) {
-            (0, from, to) if from < rest => self.versions.get_mut(to - rest).clone_from(self.rest.get(from)),
-            (0, from, to) => self.versions.copy(from - rest, to - rest),
-            (1, from, to) => self.displacement.copy(from, to),
-            (_, from, to) => self.state.copy(from, to),
+        let rest = if channel == 0 { self.layout.count() } else { 0 };
+        match (from as usize, to as usize - rest) {
+            (from, to) if from < rest => self.slots[0].bytes_mut(to).copy_from_slice(self.rest.bytes(from)),
+            (from, to) => self.slots[channel].copy(from - rest, to),
         }
     }
 
     pub(crate) fn note_spare(&self) {
         self.control.spare_slots_low.fetch_min(self.free[0].len() as u64, Relaxed);
     }
+}
+
+/// Maps the slots of every channel that there is.
+pub(crate) fn open_slots(domain: &Domain, index: &IndexMap, access: Access, prefault: bool) -> Result<[Slots; CHANNELS], StoreError> {
+    let mut slots = Vec::with_capacity(CHANNELS);
+    for (n, (spec, channel)) in SPECS.iter().zip(&index.layout.channels).enumerate() {
+        let rest = if n == 0 { channel.entry_count } else { 0 };
+        let count = (channel.slot_count - rest) as usize;
+        slots.push(Slots::open(domain, spec.segment, count, spec.slot_bytes, access, prefault && spec.prefault)?);
+    }
+    Ok(slots.try_into().unwrap_or_else(|_| unreachable!("one for each channel")))
 }

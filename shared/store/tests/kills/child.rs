@@ -103,7 +103,13 @@ fn write(domain: &Domain, seed: u64) -> ! {
     let mut done = State::of(writer.state()).transaction;
     say(Said::Opened(writer.epoch(), done));
     loop {
-        while !writer.has_room() {
+        loop {
+            if let Some(epoch) = writer.publish_deferred() {
+                say(Said::Published(done, epoch, 0));
+            }
+            if writer.has_room() {
+                break;
+            }
             std::thread::sleep(Duration::from_micros(100));
         }
         let number = done + 1;

@@ -21,7 +21,7 @@ mod world;
 
 use child::Said;
 use maille_contract::Role;
-use maille_store::{Reader, StoreSizes, fault};
+use maille_store::{Reader, fault};
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
 use tissue::{Random, State};
@@ -308,7 +308,7 @@ fn stopped_readers() {
     // where there is little room all is put off while the reader stands, and published when it goes on
     for (stopped_at, roomy) in [("anywhere", true), ("pin-pending", true), ("head-loaded", true), ("pinned", true), ("anywhere", false)] {
         let slots = if roomy { (1 + PINS_EACH) * tissue::BRICKS + tissue::DIRTY as usize } else { tissue::SIZES.spare_slots };
-        let world = World::new(StoreSizes { spare_slots: slots, displacement_slots: slots });
+        let world = World::new(tissue::sizes(slots, slots));
         let seed = number("MAILLE_SEED", 1);
         let writer = world.writer(seed, &[]);
         let at = format!("{stopped_at}:20:stop");

@@ -2,7 +2,7 @@
 //! block says which transaction wrote each brick last. So one look at a snapshot tells torn bricks from whole ones, and one
 //! consistent state from a mixture of two.
 
-use maille_store::{DISPLACEMENT_LEN, STATE_BYTES, Snapshot, StoreSizes, Transaction};
+use maille_store::{Cuts, DISPLACEMENT_LEN, Plastic, STATE_BYTES, Snapshot, StoreSizes, Transaction};
 use maille_volume::{Brick, BrickSource, Grid, Rescale, Volume};
 
 /// Voxels along each axis.
@@ -13,7 +13,12 @@ pub const BRICKS: usize = 125;
 pub const DIRTY: u64 = 24;
 
 /// Room for one version of every brick, another that one stopped reader holds, and a transaction: with eight it runs out now and then.
-pub const SIZES: StoreSizes = StoreSizes { spare_slots: 2 * BRICKS + 2 * DIRTY as usize, displacement_slots: 2 * BRICKS + DIRTY as usize };
+pub const SIZES: StoreSizes = sizes(2 * BRICKS + 2 * DIRTY as usize, 2 * BRICKS + DIRTY as usize);
+
+/// Every channel that a deforming tissue has.
+pub const fn sizes(spare_slots: usize, displacement_slots: usize) -> StoreSizes {
+    StoreSizes { spare_slots, displacement_slots, plastic_slots: displacement_slots, cut_slots: displacement_slots, label_slots: 0 }
+}
 
 /// The volume at rest.
 pub fn volume() -> Volume {
@@ -106,6 +111,8 @@ pub fn change(t: &mut Transaction<'_>, seed: u64, transaction: u64, epoch: u64) 
         if random.below(3) == 0 {
             let value = displacement(transaction, id);
             t.displacement_mut(id as u32).fill(value);
+            t.channel_mut::<Plastic>(id as u32).fill(-value);
+            t.channel_mut::<Cuts>(id as u32).fill(transaction as u8);
             state.displacements[id as usize] = transaction as u32;
         }
     }
@@ -151,8 +158,13 @@ pub fn check(snapshot: &Snapshot<'_>, rest: &impl BrickSource) -> Result<State, 
                 if values.iter().any(|&v| v != first) {
                     return Err((Wrong::Torn, format!("epoch {epoch}: the displacement of brick {id} is torn")));
                 }
-                if first != displacement(by, id as u64) {
-                    return Err((Wrong::Mixed, format!("epoch {epoch}: the displacement of brick {id} is not of transaction {by}")));
+                let plastic = snapshot.channel::<Plastic>(id as u32).is_some_and(|p| p.iter().all(|&v| v == -first));
+                let cuts = snapshot.channel::<Cuts>(id as u32).is_some_and(|c| c.iter().all(|&v| v == by as u8));
+                if first != displacement(by, id as u64) || !plastic || !cuts {
+                    return Err((
+                        Wrong::Mixed,
+                        format!("epoch {epoch}: displacement, plastic part and cuts of brick {id} are not of transaction {by}"),
+                    ));
                 }
             }
             _ => return Err((Wrong::Mixed, format!("epoch {epoch}: brick {id} has a displacement, or none, against its state"))),
