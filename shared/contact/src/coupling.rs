@@ -3,12 +3,17 @@
 //! A virtual wall of stiffness K and damping B (backward difference), computed with period T on a device with physical
 //! damping b, is passive if and only if  b > K·T/2 + |B|            [Colgate & Schenkel 1997].
 //! It follows from b > T/2 · Re{(1 − e^{−jωT}) H(e^{jωT})} / (1 − cos ωT) with H(z) = K + B(z − 1)/(Tz), whose right-hand
-//! side is K·T/2 − B·cos ωT.
+//! side is K·T/2 − B·cos ωT. With the reading late by t_d, H carries e^{−jωt_d}: the spring's part becomes
+//! K·T/2 · sin(ω(t_d + T/2)) / sin(ωT/2), at most K (T/2 + t_d), at ω = 0, and the damper's stays within ±B. So
+//!
+//! b > K (T/2 + t_d) + |B|.
+//!
+//! (The largest *stable* stiffness without a hand is (b + B)/(T/2 + t_d) [Hulin et al. 2014]; `tests/stability.rs` finds it in the closed loop.)
 //!
 //! The coupling caps the slope of every tissue law and its damping, so that no tissue table, however stiff, leaves the
 //! bound. Units: K [N/mm], b and B [N·s/mm], T [s].
 //! Invariant: a `Coupling` satisfies the bound for the device it was made for. Cost: constant. Allocation: none.
-//! Not here: delay (the bound with delay t_d is (b + B)/(T/2 + t_d) and is measured in benches), friction, saturation.
+//! Not here: friction, saturation; what a controller can add beyond the bound (`passivity`).
 
 use thiserror::Error;
 
@@ -50,14 +55,28 @@ impl Coupling {
     /// # Errors
     /// When b > K·T/2 + |B| does not hold.
     pub fn new(stiffness_n_per_mm: f64, damping_n_s_per_mm: f64, device_damping: f64, period_s: f64) -> Result<Self, CouplingError> {
+        Self::delayed(stiffness_n_per_mm, damping_n_s_per_mm, device_damping, period_s, 0.0)
+    }
+
+    /// Gains for a device whose readings are late by `delay_s`.
+    ///
+    /// # Errors
+    /// When b > K (T/2 + t_d) + |B| does not hold.
+    pub fn delayed(
+        stiffness_n_per_mm: f64,
+        damping_n_s_per_mm: f64,
+        device_damping: f64,
+        period_s: f64,
+        delay_s: f64,
+    ) -> Result<Self, CouplingError> {
         let (k, b) = (stiffness_n_per_mm, damping_n_s_per_mm);
         let ok = |v: f64| v.is_finite() && v >= 0.0;
-        if !(ok(k) && ok(b) && ok(device_damping) && ok(period_s) && period_s > 0.0) {
+        if !(ok(k) && ok(b) && ok(device_damping) && ok(period_s) && ok(delay_s) && period_s > 0.0) {
             return Err(CouplingError::NotAGain);
         }
-        let needed = k * period_s / 2.0 + b;
+        let needed = k * (period_s / 2.0 + delay_s) + b;
         if device_damping <= needed {
-            let allowed = Self::passive_stiffness(b, device_damping, period_s);
+            let allowed = Self::passive_stiffness_delayed(b, device_damping, period_s, delay_s);
             return Err(CouplingError::NotPassive { stiffness: k, damping: b, needed, device: device_damping, allowed });
         }
         Ok(Self { stiffness_n_per_mm: k, damping_n_s_per_mm: b })
@@ -73,12 +92,26 @@ impl Coupling {
         device_damping: f64,
         period_s: f64,
     ) -> Result<(Self, bool), CouplingError> {
-        match Self::new(stiffness_n_per_mm, damping_n_s_per_mm, device_damping, period_s) {
+        Self::lowered_delayed(stiffness_n_per_mm, damping_n_s_per_mm, device_damping, period_s, 0.0)
+    }
+
+    /// The same for a device whose readings are late by `delay_s`.
+    ///
+    /// # Errors
+    /// When an argument is no gain, or the device has no damping at all.
+    pub fn lowered_delayed(
+        stiffness_n_per_mm: f64,
+        damping_n_s_per_mm: f64,
+        device_damping: f64,
+        period_s: f64,
+        delay_s: f64,
+    ) -> Result<(Self, bool), CouplingError> {
+        match Self::delayed(stiffness_n_per_mm, damping_n_s_per_mm, device_damping, period_s, delay_s) {
             Ok(coupling) => Ok((coupling, false)),
             Err(CouplingError::NotPassive { .. }) => {
                 let b = damping_n_s_per_mm.min(0.4 * device_damping);
-                let k = stiffness_n_per_mm.min(0.95 * Self::passive_stiffness(b, device_damping, period_s));
-                Self::new(k, b, device_damping, period_s).map(|c| (c, true))
+                let k = stiffness_n_per_mm.min(0.95 * Self::passive_stiffness_delayed(b, device_damping, period_s, delay_s));
+                Self::delayed(k, b, device_damping, period_s, delay_s).map(|c| (c, true))
             }
             Err(error) => Err(error),
         }
@@ -86,7 +119,12 @@ impl Coupling {
 
     /// Stiffness [N/mm] at which the bound is reached: 2 (b − |B|) / T, at least 0.
     pub fn passive_stiffness(damping_n_s_per_mm: f64, device_damping: f64, period_s: f64) -> f64 {
-        (2.0 * (device_damping - damping_n_s_per_mm.abs()) / period_s).max(0.0)
+        Self::passive_stiffness_delayed(damping_n_s_per_mm, device_damping, period_s, 0.0)
+    }
+
+    /// Stiffness [N/mm] at which the bound with delay is reached: (b − |B|) / (T/2 + t_d), at least 0.
+    pub fn passive_stiffness_delayed(damping_n_s_per_mm: f64, device_damping: f64, period_s: f64, delay_s: f64) -> f64 {
+        ((device_damping - damping_n_s_per_mm.abs()) / (period_s / 2.0 + delay_s)).max(0.0)
     }
 
     /// Largest slope of force over depth [N/mm].
@@ -124,5 +162,36 @@ mod tests {
             assert!(0.005 > c.stiffness_n_per_mm() * 1e-3 / 2.0 + c.damping_n_s_per_mm());
             assert_eq!(lowered, c.stiffness_n_per_mm() != k || c.damping_n_s_per_mm() != b);
         }
+    }
+
+    /// Two ways to the bound: the formula, and the largest real part over all frequencies up to Nyquist's.
+    #[test]
+    fn the_bound_is_the_supremum_over_frequencies() {
+        let period = 1e-3;
+        for (k, b, delay) in [(1.0, 0.0, 0.0), (1.0, 0.0, 1e-3), (1.0, 0.0, 5e-3), (2.0, 3e-4, 0.0), (0.0, 1e-3, 0.0)] {
+            let mut worst = 0.0f64;
+            for n in 1..=20_000 {
+                let w = std::f64::consts::PI / period * f64::from(n) / 20_000.0;
+                // Re{(1 − e^{−jωT}) (K + B (1 − e^{−jωT})/T) e^{−jωt_d}}
+                let re = |x: f64| (w * x).cos();
+                let spring = re(delay) - re(delay + period);
+                let damper = (re(delay) - 2.0 * re(delay + period) + re(delay + 2.0 * period)) / period;
+                worst = worst.max(period / 2.0 * (k * spring + b * damper) / (1.0 - (w * period).cos()));
+            }
+            assert!(Coupling::delayed(k, b, 1.001 * worst, period, delay).is_ok(), "{k} {b} {delay}: {worst}");
+            assert!(Coupling::delayed(k, b, 0.999 * worst, period, delay).is_err(), "{k} {b} {delay}: {worst}");
+        }
+    }
+
+    #[test]
+    fn delay_lowers_what_is_allowed() {
+        // b = 1 N·s/m: 2000, 667, 400, 182 N/m at 0, 1, 2 and 5 ms
+        for (delay, allowed) in [(0.0, 2.0), (1e-3, 2.0 / 3.0), (2e-3, 0.4), (5e-3, 2.0 / 11.0)] {
+            assert!((Coupling::passive_stiffness_delayed(0.0, 1e-3, 1e-3, delay) - allowed).abs() < 1e-9);
+            let (c, lowered) = Coupling::lowered_delayed(1.99, 0.0, 1e-3, 1e-3, delay).unwrap();
+            assert_eq!(lowered, delay > 0.0);
+            assert!(c.stiffness_n_per_mm() <= allowed && c.stiffness_n_per_mm() > 0.9 * allowed);
+        }
+        assert_eq!(Coupling::delayed(1.0, 0.0, 1.0, 1e-3, f64::NAN), Err(CouplingError::NotAGain));
     }
 }
