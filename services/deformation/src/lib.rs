@@ -10,6 +10,8 @@
 #![forbid(unsafe_code)]
 
 mod announce;
+#[cfg(test)]
+mod recovery;
 mod restore;
 mod state;
 mod step;
@@ -86,9 +88,8 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
         let due = now.saturating_sub(last_step) >= shortest_ns && writer.has_room();
         let Some(message) = due.then(|| moves.latest()).flatten() else {
             if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && !touched(life.control()) {
-                let dt_s = (now - last_step).min(2 * RELAX_NS) as f64 * 1e-9;
                 last_step = now;
-                if let Some(done) = engine.relax(dt_s, &reader, &mut writer) {
+                if let Some(done) = engine.relax(now, 2 * RELAX_NS, &reader, &mut writer) {
                     announcer.step(&mut life, &done, now, None);
                     continue;
                 }
@@ -101,8 +102,11 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             life.cell().count(Counter::Refused, 1);
             continue;
         };
+        if engine.has_answered(&message) {
+            continue;
+        }
         last_step = now;
-        if let Some(done) = engine.step(&message, &reader, &mut writer) {
+        if let Some(done) = engine.step(&message, now, &reader, &mut writer) {
             announcer.step(&mut life, &done, now, Some(message.stamp.sequence));
         }
     }

@@ -1,6 +1,7 @@
 //! The small state that belongs to every transaction beside voxels and displacements.
 
 use bytemuck::{Pod, Zeroable};
+use maille_contract::Stamp;
 use maille_store::STATE_BYTES;
 
 /// First bytes of the store's state block.
@@ -11,14 +12,16 @@ pub(crate) struct State {
     pub version: u64,
     /// value where tissue begins (HU)
     pub threshold_hu: f64,
-    /// sequence of the last tool move that was answered
-    pub last_move: u64,
     /// pushes so far
     pub pushes: u64,
+    /// the last tool move that was answered
+    pub last_move: Stamp,
+    /// CLOCK_MONOTONIC [ns] of the last step: from here relaxation goes on
+    pub last_step_ns: u64,
 }
 
 /// Version of [`State`].
-pub(crate) const VERSION: u64 = 1;
+pub(crate) const VERSION: u64 = 2;
 
 const _: () = assert!(size_of::<State>() <= STATE_BYTES);
 

@@ -10,7 +10,7 @@ use crate::state::{State, VERSION};
 use maille_chainmail::{
     Admission, ChainMail, ChangedRegion, Motion, Pin, Tissue, elements_in_sphere, enclosing_elements, intersection_search,
 };
-use maille_contract::ToolMove;
+use maille_contract::{Stamp, ToolMove};
 use maille_displacement::{along_axes, in_patient};
 use maille_mapper::{BrickSink, MapOptions, Mapper, rest_position};
 use maille_scene::{Pins, Push, Scene};
@@ -77,7 +77,7 @@ impl Engine {
             },
         };
         let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: VOID_HU };
-        let state = State { version: VERSION, threshold_hu: d.threshold_hu, last_move: 0, pushes: 0 };
+        let state = State { version: VERSION, threshold_hu: d.threshold_hu, pushes: 0, last_move: Stamp::default(), last_step_ns: 0 };
         let relaxation_s = scene.has_effect("relaxation").then_some(d.relaxation_s);
         Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, mapper: Mapper::new(), relaxation_s }
     }
@@ -87,8 +87,13 @@ impl Engine {
         self.state.threshold_hu = threshold_hu;
     }
 
-    /// Answers a tool move; `None` when there is nothing to push.
-    pub fn step(&mut self, message: &ToolMove, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+    /// Whether this very move was answered, perhaps by a predecessor that died after its commit.
+    pub fn has_answered(&self, message: &ToolMove) -> bool {
+        self.state.pushes > 0 && self.state.last_move == message.stamp
+    }
+
+    /// Answers a tool move at `now_ns`; `None` when there is nothing to push.
+    pub fn step(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         let (from, push) = self.surface_push(message, reader)?;
         let grid = &reader.info().grid;
         let rest_mm = rest_position(&self.mail, grid, from)?;
@@ -103,7 +108,8 @@ impl Engine {
         if pushed.moved == 0 {
             return None;
         }
-        self.state.last_move = message.stamp.sequence;
+        self.state.last_move = message.stamp;
+        self.state.last_step_ns = now_ns;
         self.state.pushes += 1;
         let refused_mm = in_patient(grid, pushed.refused_mm.map(f64::from));
         Some(Done { moved_elements: pushed.moved, refused_mm, ..self.commit(&pushed.region, reader, writer) })
@@ -114,8 +120,10 @@ impl Engine {
         self.relaxation_s.is_some()
     }
 
-    /// Lets tissue creep towards rest for `dt_s`; `None` when it is there.
-    pub fn relax(&mut self, dt_s: f64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+    /// Lets tissue creep towards rest from the last step to `now_ns`, at most for `longest_ns`; `None` when it is there.
+    pub fn relax(&mut self, now_ns: u64, longest_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let dt_s = now_ns.saturating_sub(self.state.last_step_ns).min(longest_ns) as f64 * 1e-9;
+        self.state.last_step_ns = now_ns;
         let keep = (-dt_s / self.relaxation_s?).exp() as f32;
         let region = self.mail.relax(keep, SNAP_MM);
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))

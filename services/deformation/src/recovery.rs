@@ -1,0 +1,314 @@
+//! A restart changes nothing: the real engine on a real store, dropped or killed at random instants, against one that never was.
+//!
+//! Two worlds get the same random work: pushes, steps of relaxation, changes of the threshold. In one the process goes on for ever; in
+//! the other it is ended and started again, between steps, and in the middle of them at every named point of the store
+//! (`fault::die_here`: the stack is unwound, which writes nothing into shared memory). A step whose commit had not become visible is
+//! done again by the successor; one that had is not. After every step all voxels, skip cells, displacements and the state are
+//! the same, bit for bit.
+//!
+//! `MAILLE_RESTARTS=2000 cargo test -p maille-deformation recovery` looks longer; `MAILLE_SEED` gives other work.
+
+use crate::{
+    restore::restore,
+    step::{Done, Engine},
+};
+use maille_contract::{Role, Stamp, ToolMove};
+use maille_scene::{Pins, Scene};
+use maille_store::{
+    CommitOutcome, Reader, Snapshot, StoreKeeper, StoreSizes, Writer,
+    fault::{Died, Point, die_here, live_on},
+};
+use maille_transport::{ControlMap, Domain};
+use maille_volume::{BrickSource, Grid, Rescale, Volume};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+
+/// splitmix64.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+    fn below(&mut self, n: u64) -> u64 {
+        self.next() % n
+    }
+    fn within(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * (self.next() >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+fn number(name: &str, otherwise: u64) -> u64 {
+    std::env::var(name).map_or(otherwise, |text| text.parse().unwrap_or_else(|_| panic!("{name} is a number, not {text:?}")))
+}
+
+/// Voxels along i, j, k.
+const SIZE: [usize; 3] = [48, 40, 44];
+/// Spacing [mm].
+const SPACING: [f64; 3] = [1.0, 1.0, 1.25];
+/// Height of the surface [mm]: tissue below, air above.
+const SURFACE_MM: f64 = 36.0;
+
+/// Soft tissue of changing density under air, with bone in it.
+fn volume() -> Volume {
+    let grid = Grid::axis_aligned(SIZE, SPACING);
+    let mut voxels = Vec::with_capacity(grid.voxel_count());
+    for k in 0..SIZE[2] {
+        for j in 0..SIZE[1] {
+            for i in 0..SIZE[0] {
+                let (x, y, z) = (i as f64 * SPACING[0], j as f64 * SPACING[1], k as f64 * SPACING[2]);
+                let bone = (x - 34.0).powi(2) + (y - 20.0).powi(2) + (z - 20.0).powi(2) < 36.0;
+                let soft = 40.0 + 60.0 * (0.4 * x).sin() * (0.3 * y).cos() + 15.0 * (0.7 * z).sin();
+                // a surface of some voxels' thickness, as in a CT
+                let depth = ((SURFACE_MM - z) / 2.0).clamp(-1.0, 1.0);
+                let hu = if bone { 900.0 } else { -460.0 + (soft + 460.0) * depth + if depth < 0.0 { 500.0 * depth } else { 0.0 } };
+                voxels.push(hu.round() as i16);
+            }
+        }
+    }
+    Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels)
+}
+
+/// What a process holds.
+struct Process {
+    engine: Engine,
+    writer: Writer,
+    reader: Reader,
+}
+
+struct World {
+    domain: Domain,
+    _control: ControlMap,
+    _keeper: StoreKeeper,
+    scene: Scene,
+    process: Option<Process>,
+}
+
+impl World {
+    fn new(scene: &Scene) -> Self {
+        let volume = volume();
+        let domain = Domain::fresh().unwrap();
+        let control = ControlMap::create(&domain).unwrap();
+        let sizes = StoreSizes::for_volume(27, 27, 3, true);
+        let sizes = StoreSizes { plastic_slots: sizes.displacement_slots, cut_slots: sizes.displacement_slots, ..sizes };
+        let keeper = StoreKeeper::create(&domain, &volume, sizes, |_| {}).unwrap();
+        let mut world = Self { domain, _control: control, _keeper: keeper, scene: scene.clone(), process: None };
+        world.start(None);
+        world
+    }
+
+    /// As `run` starts: opens, restores, and takes the threshold that the page shows.
+    fn start(&mut self, shown: Option<f64>) {
+        self.process = None;
+        let (writer, reader) = (Writer::open(&self.domain).unwrap(), Reader::open(&self.domain, Role::Deformation).unwrap());
+        writer.audit().unwrap();
+        let mut engine = Engine::new(&self.scene, reader.info());
+        restore(&mut engine, &writer);
+        if let Some(threshold_hu) = shown {
+            engine.set_threshold(threshold_hu);
+        }
+        self.process = Some(Process { engine, writer, reader });
+    }
+
+    fn process(&mut self) -> &mut Process {
+        self.process.as_mut().expect("a process runs")
+    }
+
+    fn snapshot(&self) -> Snapshot<'_> {
+        self.process.as_ref().expect("a process runs").reader.snapshot()
+    }
+}
+
+impl Drop for World {
+    fn drop(&mut self) {
+        self.process = None;
+        self.domain.remove().unwrap();
+    }
+}
+
+/// What a step does.
+#[derive(Clone, Copy, Debug)]
+enum Work {
+    Push(ToolMove),
+    Relax,
+}
+
+impl Process {
+    fn work(&mut self, work: Work, now_ns: u64) -> Option<Done> {
+        match work {
+            Work::Push(message) => self.engine.step(&message, now_ns, &self.reader, &mut self.writer),
+            Work::Relax => self.engine.relax(now_ns, 66_000_000, &self.reader, &mut self.writer),
+        }
+    }
+}
+
+/// A tip that presses somewhere into the surface, from above and not quite straight.
+fn push(random: &mut Random, sequence: u64) -> ToolMove {
+    let at = [random.within(6.0, 42.0), random.within(6.0, 34.0)];
+    let (depth, radius) = (random.within(0.5, 6.0), random.within(0.5, 3.0));
+    let lean = [random.within(-0.3, 0.3), random.within(-0.3, 0.3)];
+    let length = (lean[0] * lean[0] + lean[1] * lean[1] + 1.0f64).sqrt();
+    let normal = [lean[0] / length, lean[1] / length, 1.0 / length];
+    let tip = [at[0], at[1], SURFACE_MM - depth + radius];
+    let outside = std::array::from_fn(|c| tip[c] + normal[c] * (depth + 8.0));
+    let contact = [at[0], at[1], SURFACE_MM];
+    let stamp = Stamp { time_ns: sequence * 16_000_000, sequence, incarnation: 1 };
+    ToolMove { stamp, tip_mm: tip, outside_mm: outside, contact_mm: contact, normal, depth_mm: depth, radius_mm: radius }
+}
+
+/// The first difference between what two worlds show.
+fn difference(a: &Snapshot<'_>, b: &Snapshot<'_>) -> Option<String> {
+    if a.epoch() != b.epoch() || a.state() != b.state() {
+        let at = (0..a.state().len()).find(|&n| a.state()[n] != b.state()[n]);
+        return Some(format!("epochs {} and {}, first byte of the state that differs {at:?}", a.epoch(), b.epoch()));
+    }
+    for id in 0..a.layout().count() as u32 {
+        let (x, y) = (a.brick(id), b.brick(id));
+        if let Some(n) = (0..x.voxels.len()).find(|&n| x.voxels[n] != y.voxels[n]) {
+            return Some(format!("brick {id}, stored voxel {n}: {} and {}", x.voxels[n], y.voxels[n]));
+        }
+        if x.cells != y.cells {
+            return Some(format!("skip cells of brick {id}"));
+        }
+        let bits = |s: &Snapshot<'_>| s.displacement(id).map(|d| d.map(f32::to_bits));
+        if bits(a) != bits(b) {
+            return Some(format!("displacement of brick {id}"));
+        }
+        if a.channel::<maille_store::Cuts>(id) != b.channel::<maille_store::Cuts>(id) {
+            return Some(format!("cuts of brick {id}"));
+        }
+    }
+    None
+}
+
+/// What happened.
+#[derive(Debug, Default)]
+struct Tally {
+    commits: u64,
+    relaxations: u64,
+    /// between steps
+    restarts: u64,
+    /// at a point, before the commit was visible
+    deaths_before: u64,
+    /// at a point, after it was
+    deaths_after: u64,
+    /// points at which somebody died
+    points: std::collections::BTreeSet<&'static str>,
+}
+
+fn run(scene: &Scene, seed: u64, wanted: u64) -> Tally {
+    let (mut whole, mut broken) = (World::new(scene), World::new(scene));
+    let (mut random, mut tally) = (Random(seed), Tally::default());
+    let (in_recovery, in_commit) = Point::OF_WRITER.split_at(2);
+    let (mut now_ns, mut sequence, mut shown) = (1_000_000_000u64, 0, None);
+    while tally.restarts + tally.deaths_before + tally.deaths_after < wanted {
+        now_ns += 10_000_000 + random.below(50_000_000);
+        // the page moves the threshold now and then
+        if random.below(12) == 0 {
+            shown = Some(random.within(-400.0, -200.0));
+            for world in [&mut whole, &mut broken] {
+                world.process().engine.set_threshold(shown.expect("just set"));
+            }
+        }
+        let work = if random.below(3) == 0 {
+            Work::Relax
+        } else {
+            sequence += 1;
+            Work::Push(push(&mut random, sequence))
+        };
+        let done = whole.process().work(work, now_ns);
+        tally.commits += u64::from(done.is_some());
+        tally.relaxations += u64::from(done.is_some() && matches!(work, Work::Relax));
+
+        if random.below(5) == 0 {
+            broken.start(shown);
+            tally.restarts += 1;
+        }
+        let (point, name) = in_commit[random.below(in_commit.len() as u64) as usize];
+        if random.below(2) == 0 {
+            // some points are passed once a commit, others once a brick or page
+            let often = [Point::BrickCopied, Point::RecordBorn, Point::Superseding, Point::Reclaiming].contains(&point);
+            die_here(point, if often { 1 + random.below(6) as u32 } else { 1 });
+        }
+        let before = broken.process().writer.epoch();
+        let outcome = catch_unwind(AssertUnwindSafe(|| broken.process().work(work, now_ns)));
+        live_on();
+        match outcome {
+            Ok(again) => assert_eq!(again.map(|d| d.moved_elements), done.map(|d| d.moved_elements)),
+            Err(payload) => {
+                let Some(Died(_)) = payload.downcast_ref() else { resume_unwind(payload) };
+                tally.points.insert(name);
+                // the successor dies as well now and then: while it recovers
+                if random.below(2) == 0 {
+                    let (point, name) = in_recovery[random.below(2) as usize];
+                    die_here(point, if point == Point::Recovering { 1 + random.below(400) as u32 } else { 1 });
+                    if catch_unwind(AssertUnwindSafe(|| broken.start(shown))).is_err() {
+                        tally.points.insert(name);
+                    }
+                    live_on();
+                }
+                broken.start(shown);
+                if broken.process().writer.epoch() == before {
+                    tally.deaths_before += 1;
+                    let again = broken.process().work(work, now_ns);
+                    assert!(again.is_some_and(|d| matches!(d.outcome, CommitOutcome::Published { .. })), "what was lost can be done again");
+                } else {
+                    tally.deaths_after += 1;
+                }
+            }
+        }
+        if let Some(difference) = difference(&whole.snapshot(), &broken.snapshot()) {
+            panic!("seed {seed}, after {work:?}: {difference}; {tally:?}");
+        }
+    }
+    let world = broken.process();
+    world.writer.audit().unwrap();
+    tally
+}
+
+#[test]
+fn a_restart_anywhere_changes_no_bit_of_what_follows() {
+    let mut scene = Scene::builtin_default();
+    let wanted = number("MAILLE_RESTARTS", 120);
+    let seed = number("MAILLE_SEED", 1);
+    for (n, pins) in [Pins::Enclosing, Pins::Sphere].into_iter().enumerate() {
+        scene.deformation.pins = pins;
+        let tally = run(&scene, seed + n as u64, wanted);
+        println!(
+            "{pins:?}: {} commits ({} of relaxation) the same bit for bit through {} restarts between steps, {} deaths before the commit and {} after \
+             it, at {} points: {:?}",
+            tally.commits,
+            tally.relaxations,
+            tally.restarts,
+            tally.deaths_before,
+            tally.deaths_after,
+            tally.points.len(),
+            tally.points
+        );
+        assert!(tally.commits > wanted / 2 && tally.relaxations > wanted / 20, "{tally:?}");
+        assert!(tally.deaths_before > wanted / 6 && tally.deaths_after > wanted / 12 && tally.points.len() >= 12, "{tally:?}");
+    }
+}
+
+/// The test itself can fail: a successor that forgets one thing is found.
+#[test]
+fn a_successor_that_forgets_something_is_found() {
+    let scene = Scene::builtin_default();
+    let (mut whole, mut broken) = (World::new(&scene), World::new(&scene));
+    let mut random = Random(5);
+    let step = |world: &mut World, message: ToolMove| world.process().work(Work::Push(message), message.stamp.time_ns).is_some();
+    for n in 1..6 {
+        let message = push(&mut random, n);
+        assert_eq!(step(&mut whole, message), step(&mut broken, message));
+    }
+    assert_eq!(difference(&whole.snapshot(), &broken.snapshot()), None);
+    broken.start(None);
+    // as if displacements had not been in the transaction
+    broken.process().engine = Engine::new(&scene, &volume().info);
+    let message = push(&mut random, 7);
+    step(&mut whole, message);
+    step(&mut broken, message);
+    assert!(difference(&whole.snapshot(), &broken.snapshot()).is_some());
+}
