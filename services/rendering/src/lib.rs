@@ -8,6 +8,8 @@
 #![forbid(unsafe_code)]
 
 mod compose;
+#[cfg(test)]
+mod in_place;
 mod overlay;
 mod view;
 
