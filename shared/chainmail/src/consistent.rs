@@ -7,18 +7,19 @@
 //! Cost: one search (binary heap) a component and envelope, over the elements nearer to a pin than the targets differ.
 
 use crate::{
-    brick::DisplacementBrick,
-    state::Elements,
-    tissue::{Tissue, link_limit},
+    graph::{MOST, Neighbour, Ordered, neighbours},
+    links::Rules,
+    state::{Elements, Model},
 };
-use maille_volume::{BrickSource, brick::EDGE};
+use maille_volume::BrickSource;
 use std::collections::{BinaryHeap, HashMap};
 
 /// Replaces the targets of one component, in place.
 pub fn make_consistent<S: BrickSource + ?Sized>(
     rest: &S,
-    tissue: &Tissue,
+    model: &Model,
     elements: &mut Elements,
+    component: usize,
     voxels: &[[usize; 3]],
     targets: &mut [f32],
 ) {
@@ -26,8 +27,11 @@ pub fn make_consistent<S: BrickSource + ?Sized>(
     if low >= high {
         return;
     }
-    let upper = envelope(rest, tissue, elements, voxels, targets, 1.0);
-    let lower = envelope(rest, tissue, elements, voxels, targets, -1.0);
+    let mut envelope = |sign: f32| {
+        let rules = Rules::new(&model.links, elements.spacing(), component, sign);
+        envelope(rest, model, elements, &rules, voxels, targets, sign)
+    };
+    let (upper, lower) = (envelope(1.0), envelope(-1.0));
     for (n, target) in targets.iter_mut().enumerate() {
         // consistent pins keep their bits
         if upper[n] != *target || lower[n] != *target {
@@ -39,8 +43,9 @@ pub fn make_consistent<S: BrickSource + ?Sized>(
 /// max over pins q of sign·t_q − d(p, q), times sign, at each pin p.
 fn envelope<S: BrickSource + ?Sized>(
     rest: &S,
-    tissue: &Tissue,
+    model: &Model,
     elements: &mut Elements,
+    rules: &Rules,
     voxels: &[[usize; 3]],
     targets: &[f32],
     sign: f32,
@@ -54,47 +59,20 @@ fn envelope<S: BrickSource + ?Sized>(
         *slot = slot.max(value);
         heap.push((Ordered(value), *voxel));
     }
+    let mut linked = [Neighbour::default(); MOST];
     while let Some((Ordered(value), voxel)) = heap.pop() {
         if value < best[&voxel] {
             continue;
         }
-        let o = offset(rest, tissue, elements, voxel);
-        for side in 0..6 {
-            let Some(next) = step(elements.layout().size, voxel, side) else { continue };
-            let candidate = value - link_limit(o, offset(rest, tissue, elements, next), elements.spacing()[side / 2]);
+        let count = neighbours(elements, rest, model, rules, voxel, &mut linked);
+        for next in &linked[..count] {
+            let candidate = value - next.limit;
             // below the lowest target nothing can be raised any more
-            if candidate > floor && best.get(&next).is_none_or(|&b| candidate > b) {
-                best.insert(next, candidate);
-                heap.push((Ordered(candidate), next));
+            if candidate > floor && best.get(&next.voxel).is_none_or(|&b| candidate > b) {
+                best.insert(next.voxel, candidate);
+                heap.push((Ordered(candidate), next.voxel));
             }
         }
     }
     voxels.iter().map(|v| sign * best[v]).collect()
-}
-
-fn offset<S: BrickSource + ?Sized>(rest: &S, tissue: &Tissue, elements: &mut Elements, [i, j, k]: [usize; 3]) -> f32 {
-    let slot = elements.load_with_limits(rest, tissue, elements.layout().brick_of(i, j, k));
-    elements.limits(slot).offset[DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE)]
-}
-
-/// The neighbour on a side (axis·2, +1 upwards), inside `size`.
-pub fn step(size: [usize; 3], mut voxel: [usize; 3], side: usize) -> Option<[usize; 3]> {
-    let axis = side / 2;
-    voxel[axis] = if side % 2 == 1 { voxel[axis] + 1 } else { voxel[axis].checked_sub(1)? };
-    (voxel[axis] < size[axis]).then_some(voxel)
-}
-
-/// A float that is never NaN, in order.
-#[derive(Clone, Copy, PartialEq)]
-struct Ordered(f32);
-impl Eq for Ordered {}
-impl PartialOrd for Ordered {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-impl Ord for Ordered {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        self.0.total_cmp(&other.0)
-    }
 }

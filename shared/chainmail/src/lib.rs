@@ -20,32 +20,42 @@
 //! the chain regions are. The admissible part of a push is its clamp to ±M, M(x) = min_y (m(y) + d(x, y)) with m = 0 on
 //! bone, found only where the push reaches ([`Admission`] says whether by component or along the push).
 //!
-//! Units and frame: u in mm *along the grid's axes* (not LPS); [`maille_displacement::in_patient`] rotates. `f32`.
+//! Units and frame: u in mm *along the grid's axes* (not LPS); `maille_displacement::in_patient` rotates. `f32`.
 //! Invariants: after every push all links hold up to rounding (a few ulp of |u|), bone has u = 0 bit for bit, |u_c| ≤ m. Subtraction of
 //! floats is monotone, so the result is the same bits whatever the order of propagation.
-//! Cost: in proportion to the moved elements, in bricks on demand. Not here: voxels ([`maille_mapper`] rewrites them),
-//! cuts.
+//! Cost: in proportion to the moved elements, in bricks on demand. Not here: voxels ([`maille_mapper`] rewrites them).
 //!
 //! [`maille_mapper`]: https://docs.rs/maille-mapper
 
 #![forbid(unsafe_code)]
 
 mod brick;
+mod by_element;
 mod consistent;
+mod cut;
 mod elements;
+mod from_rest;
+mod graph;
 mod intersection;
+mod links;
 mod mail;
 mod propagate;
+mod push;
 pub mod reference;
 mod region;
 mod relax;
+mod relaxation;
+mod repair;
 mod state;
 mod tile;
 mod tissue;
 
-pub use brick::DisplacementBrick;
+pub use brick::{DisplacementBrick, ELEMENTS};
+pub use cut::{Triangle, swept_blade};
 pub use elements::{elements_in_sphere, enclosing_elements};
 pub use intersection::intersection_search;
+pub use links::{AxisLimits, CUT, Gaps, LinkModel, Metric, Slender};
 pub use mail::{ChainMail, Motion, Pin, PushOutcome};
 pub use region::{ChangedBrick, ChangedRegion};
+pub use relaxation::{Capsule, PlasticBand, RelaxOptions, Relaxed};
 pub use tissue::{Admission, ElementLimits, Tissue, link_limit};

@@ -1,17 +1,15 @@
-//! The state of the mail, and the push: what is admissible, then raise and lower.
-//!
-//! A push first tries the whole motion, component by component. Where no bound (bone, border, movement limit) refused
-//! anything, that is the answer. Where one did, the elements at their bounds pull the trial down again by the same propagation
-//! in the other direction, which leaves min(t_p, M(p)) at each pin; the trial is undone and the admissible motion takes
-//! its place. So M is computed only where a push reaches.
+//! The state of the mail: what is displaced, what is allowed, what was cut. Pushes are in [`crate::push`].
 
 use crate::{
     brick::{DisplacementBrick, ELEMENTS},
-    consistent::make_consistent,
-    propagate::{Before, Propagation, Scratch},
+    by_element::Waiting,
+    from_rest::Octant,
+    links::{CUT, LinkModel, Metric, Rules},
+    propagate::{Before, Scratch},
     region::{ChangedBrick, ChangedRegion},
-    state::{Elements, limits_at},
-    tissue::{Admission, Tissue, link_limit},
+    relaxation::PlasticBand,
+    state::{Elements, Model},
+    tissue::{Tissue, link_limit},
 };
 use maille_volume::{BrickId, BrickLayout, BrickSource, VolumeInfo, brick::EDGE};
 
@@ -52,17 +50,18 @@ pub struct PushOutcome {
 
 /// ChainMail on one volume.
 pub struct ChainMail {
-    tissue: Tissue,
-    elements: Elements,
-    before: Before,
-    scratch: Scratch,
+    pub(crate) model: Model,
+    pub(crate) elements: Elements,
+    pub(crate) before: Before,
+    pub(crate) scratch: Scratch,
+    pub(crate) waiting: Waiting,
+    pub(crate) octants: [Octant; 3],
+    pub(crate) plasticity: Vec<PlasticBand>,
+    pub(crate) by_element: bool,
 }
 
 /// Longest motion of a pin [mm]; a longer one is cut to it, so that no arithmetic overflows. Far beyond any patient.
 pub const MAX_MOTION_MM: f32 = 1e6;
-
-/// Copies of components kept between pushes so that a push allocates nothing once warm.
-const SPARE_COPIES: usize = 4096;
 
 impl ChainMail {
     /// Tissue at rest.
@@ -72,20 +71,61 @@ impl ChainMail {
     pub fn new(info: &VolumeInfo, tissue: Tissue) -> Self {
         assert_eq!(tissue.fault(), None, "tissue parameters are checked by the caller");
         let elements = Elements::new(BrickLayout::new(info.grid.size), info.grid.spacing.map(|s| s as f32));
-        Self { tissue, elements, before: Before::default(), scratch: Scratch::new() }
+        Self {
+            model: Model { tissue, links: LinkModel::default() },
+            elements,
+            before: Before::default(),
+            scratch: Scratch::new(),
+            waiting: Waiting::new(),
+            octants: Default::default(),
+            plasticity: Vec::new(),
+            by_element: false,
+        }
     }
 
     /// Parameters of the tissue.
     pub fn tissue(&self) -> &Tissue {
-        &self.tissue
+        &self.model.tissue
     }
 
-    /// Changes the parameters: the next push obeys the new ones. Links that exist only now may be violated until a push
-    /// passes them.
+    /// Changes the parameters: the next push obeys the new ones. Links that exist only now may be violated until
+    /// [`Self::repair`] has made all of them hold.
     pub fn set_tissue(&mut self, tissue: Tissue) {
         assert_eq!(tissue.fault(), None, "tissue parameters are checked by the caller");
-        self.tissue = tissue;
+        self.model.tissue = tissue;
         self.elements.drop_limits();
+    }
+
+    /// Tissue begins at another value from now on, in deformed tissue too: links appear or vanish, and all are made to hold. Returns what
+    /// moved.
+    pub fn set_threshold<S: BrickSource + ?Sized>(&mut self, rest: &S, threshold_hu: Option<f64>) -> ChangedRegion {
+        self.set_tissue(Tissue { threshold_hu, ..self.model.tissue });
+        self.repair(rest)
+    }
+
+    /// How links depend on axis, direction, voids and cuts.
+    pub fn link_model(&self) -> &LinkModel {
+        &self.model.links
+    }
+
+    /// Changes how links depend on axis, direction, voids and cuts; [`Self::repair`] afterwards where tissue is deformed.
+    ///
+    /// # Panics
+    /// When the model makes no sense ([`LinkModel::fault`]).
+    pub fn set_link_model(&mut self, links: LinkModel) {
+        assert_eq!(links.fault(), None, "the link model is checked by the caller");
+        self.model.links = links;
+        self.elements.drop_limits();
+    }
+
+    /// Whether to propagate element by element with the cubic metric too, as the round one must: the same bits, slower, for comparison.
+    pub fn propagate_by_element(&mut self, by_element: bool) {
+        self.by_element = by_element;
+    }
+
+    /// Whether propagation goes element by element.
+    pub(crate) fn goes_by_element(&self) -> bool {
+        self.by_element || self.model.links.metric == Metric::Round
     }
 
     /// How the volume is cut into bricks.
@@ -152,12 +192,32 @@ impl ChainMail {
     /// Offset o (infinite in a void) and bound on |u_c| [mm] of an element; the bound holds the links to virtual elements.
     pub fn limits<S: BrickSource + ?Sized>(&self, rest: &S, voxel: [usize; 3]) -> (f32, f32) {
         let hu = rest.info().rescale.value(f64::from(rest.voxel(voxel[0], voxel[1], voxel[2])));
-        limits_at(&self.tissue, self.layout(), self.spacing(), voxel, hu)
+        let (offset, bound, _) = self.elements.limits_at(&self.model.tissue, voxel, hu);
+        (offset, bound)
     }
 
-    /// Limit w [mm] of the link from a voxel to its next along `axis`; infinite where there is no link. At the last voxel: that
-    /// of the link to the virtual element beyond the border.
+    /// Limits [mm] of the link from a voxel p to its next q along `axis`, for component `c` of the displacement: how far u_c(p) may exceed
+    /// u_c(q), and u_c(q) exceed u_c(p). Infinite where nothing holds them. Both voxels lie in the grid.
+    pub fn directed_link<S: BrickSource + ?Sized>(&self, rest: &S, voxel: [usize; 3], axis: usize, c: usize) -> [f32; 2] {
+        let mut next = voxel;
+        next[axis] += 1;
+        let rules = Rules::new(&self.model.links, self.spacing(), c, 1.0);
+        let of = |v: [usize; 3]| (self.limits(rest, v).0, self.flags(rest, v));
+        let (low, high) = (of(voxel), of(next));
+        [rules.up[axis].limit(axis, low, high), rules.down[axis].limit(axis, low, high)]
+    }
+
+    /// Cuts and thinness of an element, as its brick's limits have them.
+    fn flags<S: BrickSource + ?Sized>(&self, rest: &S, voxel: [usize; 3]) -> u8 {
+        self.elements.cuts(voxel) | self.elements.slender_at(rest, &self.model, voxel)
+    }
+
+    /// Base limit w [mm] of the link from a voxel to its next along `axis` ([`LinkModel`] has the factors); infinite where there is no
+    /// link. At the last voxel: that of the link to the virtual element beyond the border.
     pub fn link<S: BrickSource + ?Sized>(&self, rest: &S, voxel: [usize; 3], axis: usize) -> f32 {
+        if self.elements.cuts(voxel) & CUT[axis] != 0 {
+            return f32::INFINITY;
+        }
         let mut next = voxel;
         next[axis] = (voxel[axis] + 1).min(self.layout().size[axis] - 1);
         link_limit(self.limits(rest, voxel).0, self.limits(rest, next).0, self.spacing()[axis])
@@ -175,168 +235,6 @@ impl ChainMail {
         }
         region
     }
-
-    /// Moves pins as far as admissible and lets everything follow so that every link holds, no element further than it must.
-    /// Pins outside the grid, in voids, on bone or with motions that are not finite are left out; a pin named twice counts
-    /// with its last motion.
-    pub fn push<S: BrickSource + ?Sized>(&mut self, rest: &S, pins: &[Pin]) -> PushOutcome {
-        let (voxels, asked) = self.movable(rest, pins);
-        if voxels.is_empty() {
-            return PushOutcome::default();
-        }
-        let here: Vec<[f32; 3]> = voxels.iter().map(|&v| self.displacement(v)).collect();
-        let mut sweeps = 0;
-
-        // 1. targets, consistent among themselves
-        let mut targets: [Vec<f32>; 3] = std::array::from_fn(|c| (0..voxels.len()).map(|n| here[n][c] + asked[n][c]).collect());
-        if asked.windows(2).any(|w| w[0] != w[1]) {
-            for plane in &mut targets {
-                make_consistent(rest, &self.tissue, &mut self.elements, &voxels, plane);
-            }
-        }
-
-        // 2. try them; where bounds refuse, learn how far each pin can go
-        let mut admissible = targets.clone();
-        let mut refused = false;
-        for c in 0..3 {
-            for sign in [1.0, -1.0] {
-                let (refused_in, n) = self.propagate(rest, &voxels, &here, &targets[c], c, sign);
-                sweeps += n;
-                if !refused_in.is_empty() {
-                    refused = true;
-                    sweeps += self.propagation(rest, c, -sign, 0.0).run(refused_in).1;
-                    for (n, &voxel) in voxels.iter().enumerate() {
-                        let reached = self.displacement(voxel)[c];
-                        // the part between here and the target, never back beyond where the pin is
-                        if sign * (targets[c][n] - here[n][c]) > 0.0 {
-                            admissible[c][n] = sign * (sign * reached).clamp(sign * here[n][c], sign * targets[c][n]);
-                        }
-                    }
-                }
-            }
-        }
-
-        // 3. with something refused: back, and once more with the admissible part
-        if refused {
-            if self.tissue.admission == Admission::Scaled {
-                scale_along_motion(&here, &targets, &mut admissible);
-            }
-            self.before.restore(&mut self.elements);
-            for (c, plane) in admissible.iter().enumerate() {
-                for sign in [1.0, -1.0] {
-                    sweeps += self.propagate(rest, &voxels, &here, plane, c, sign).1;
-                }
-            }
-        }
-
-        let mut outcome = PushOutcome { pins: voxels.len(), sweeps, admitted: [1.0; 3], ..PushOutcome::default() };
-        for c in 0..3 {
-            for n in 0..voxels.len() {
-                let (all, part) = (targets[c][n] - here[n][c], admissible[c][n] - here[n][c]);
-                if all != 0.0 {
-                    outcome.admitted[c] = outcome.admitted[c].min(part / all);
-                }
-                outcome.refused_mm[c] += (here[n][c] + asked[n][c] - admissible[c][n]) / voxels.len() as f32;
-            }
-        }
-        (outcome.region, outcome.moved) = self.changes();
-        self.before.clear(SPARE_COPIES);
-        outcome
-    }
-
-    /// Pins that can move, each once, and the motions asked of them.
-    fn movable<S: BrickSource + ?Sized>(&mut self, rest: &S, pins: &[Pin]) -> (Vec<[usize; 3]>, Vec<[f32; 3]>) {
-        let size = self.layout().size;
-        let mut movable: Vec<([usize; 3], [f32; 3])> = Vec::with_capacity(pins.len());
-        for pin in pins {
-            let inside = (0..3).all(|c| pin.voxel[c] < size[c]);
-            let (Motion::By(v) | Motion::To(v)) = pin.motion;
-            if !inside || !v.iter().all(|x| x.is_finite()) {
-                continue;
-            }
-            let [i, j, k] = pin.voxel;
-            let slot = self.elements.load_with_limits(rest, &self.tissue, self.layout().brick_of(i, j, k));
-            let (limits, n) = (self.elements.limits(slot), DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE));
-            if limits.bound[n] == 0.0 || limits.offset[n].is_infinite() {
-                continue;
-            }
-            let here = self.displacement(pin.voxel);
-            let motion = std::array::from_fn(|c| match pin.motion {
-                Motion::By(v) => v[c].clamp(-MAX_MOTION_MM, MAX_MOTION_MM),
-                Motion::To(v) => v[c].clamp(-MAX_MOTION_MM, MAX_MOTION_MM) - here[c],
-            });
-            movable.push((pin.voxel, motion));
-        }
-        // the last motion of a voxel wins; the order of pins has no other meaning
-        movable.reverse();
-        movable.sort_by_key(|m| [m.0[2], m.0[1], m.0[0]]);
-        movable.dedup_by_key(|m| m.0);
-        movable.into_iter().unzip()
-    }
-
-    /// Sets the pins of one component that move in the direction of `sign`, and propagates.
-    fn propagate<S: BrickSource + ?Sized>(
-        &mut self,
-        rest: &S,
-        voxels: &[[usize; 3]],
-        before: &[[f32; 3]],
-        targets: &[f32],
-        c: usize,
-        sign: f32,
-    ) -> (Vec<usize>, u64) {
-        // one ulp of the largest displacement is rounding, not refusal
-        let slack = targets.iter().fold(0.0f32, |m, t| m.max(t.abs())) * f32::EPSILON;
-        let (mut seeds, mut over) = (Vec::new(), Vec::new());
-        for (n, (&[i, j, k], &target)) in voxels.iter().zip(targets).enumerate() {
-            // a pin that moves the other way, or not at all, holds here, but not against the rounding of its neighbours
-            let tolerated = if sign * target > sign * before[n][c] { 0.0 } else { 2.0 * slack };
-            let slot = self.elements.load_with_limits(rest, &self.tissue, self.layout().brick_of(i, j, k));
-            let n = DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE);
-            let bound = self.elements.limits(slot).bound[n];
-            let here = self.elements.brick(slot).displacement.u[c][n];
-            if sign * target <= sign * here + tolerated {
-                continue;
-            }
-            self.before.keep(&self.elements, slot, c);
-            // a pin beyond its own bound is refused like any element
-            if sign * target > bound {
-                over.push(slot);
-            }
-            let value = sign * (sign * target).min(bound);
-            if sign * value > sign * here {
-                self.elements.brick_mut(slot).displacement.u[c][n] = value;
-            }
-            seeds.push(slot);
-        }
-        if seeds.is_empty() {
-            return (Vec::new(), 0);
-        }
-        let (mut refused, sweeps) = self.propagation(rest, c, sign, slack).run(seeds);
-        refused.extend(over);
-        (refused, sweeps)
-    }
-
-    fn propagation<'a, S: BrickSource + ?Sized>(&'a mut self, rest: &'a S, component: usize, sign: f32, slack: f32) -> Propagation<'a, S> {
-        let Self { tissue, elements, before, scratch } = self;
-        Propagation { rest, tissue, elements, before, scratch, component, sign, slack }
-    }
-
-    /// What differs from the copies kept before, and how many elements that are.
-    fn changes(&mut self) -> (ChangedRegion, u64) {
-        let mut touched: Vec<(BrickId, usize)> = self.before.slots().into_iter().map(|s| (self.elements.brick(s).id, s)).collect();
-        touched.sort_unstable();
-        let (mut region, mut moved) = (ChangedRegion::default(), 0);
-        for (id, slot) in touched {
-            let (before, now) = (self.before.of(slot), &self.elements.brick(slot).displacement.u);
-            let (changed, count) = differences(id, before, now);
-            if count > 0 {
-                region.bricks.push(changed);
-                moved += count;
-                self.elements.brick_mut(slot).measure();
-            }
-        }
-        (region, moved)
-    }
 }
 
 /// Row spans of the elements of a brick for which `changed` holds, and their number.
@@ -352,7 +250,7 @@ pub(crate) fn spans(id: BrickId, changed: impl Fn(usize) -> bool) -> (ChangedBri
 }
 
 /// Row spans of the elements of a brick whose bits differ from a copy, and their number.
-fn differences(id: BrickId, before: [Option<&[f32; ELEMENTS]>; 3], now: &[[f32; ELEMENTS]; 3]) -> (ChangedBrick, u64) {
+pub(crate) fn differences(id: BrickId, before: [Option<&[f32; ELEMENTS]>; 3], now: &[[f32; ELEMENTS]; 3]) -> (ChangedBrick, u64) {
     let (mut out, mut count) = (ChangedBrick::new(id), 0);
     for row in 0..ELEMENTS / EDGE {
         let mut bits = [0u32; EDGE];
@@ -370,25 +268,4 @@ fn differences(id: BrickId, before: [Option<&[f32; ELEMENTS]>; 3], now: &[[f32; 
         }
     }
     (out, count)
-}
-
-/// Shortens all motions by one factor so that no pin goes beyond what is admissible.
-fn scale_along_motion(here: &[[f32; 3]], targets: &[Vec<f32>; 3], admissible: &mut [Vec<f32>; 3]) {
-    let mut factor = 1.0f32;
-    for c in 0..3 {
-        for n in 0..here.len() {
-            let all = targets[c][n] - here[n][c];
-            if all != 0.0 {
-                factor = factor.min((admissible[c][n] - here[n][c]) / all);
-            }
-        }
-    }
-    let factor = factor.max(0.0);
-    for c in 0..3 {
-        for n in 0..here.len() {
-            let scaled = here[n][c] + factor * (targets[c][n] - here[n][c]);
-            // rounding must not carry a pin beyond what was found admissible
-            admissible[c][n] = if targets[c][n] >= here[n][c] { scaled.min(admissible[c][n]) } else { scaled.max(admissible[c][n]) };
-        }
-    }
 }

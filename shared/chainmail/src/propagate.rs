@@ -6,9 +6,9 @@
 
 use crate::{
     brick::ELEMENTS,
-    state::Elements,
+    links::Rules,
+    state::{Elements, Model},
     tile::{Outcome, Sides, Tile, Visited},
-    tissue::Tissue,
 };
 use maille_volume::BrickSource;
 use rayon::prelude::*;
@@ -98,8 +98,10 @@ type Due = (usize, [u16; 3], bool);
 /// What a propagation did so far.
 #[derive(Default)]
 struct Done {
-    /// bricks in which a bound refused
-    refused: Vec<usize>,
+    /// bricks in which a bound held something back
+    held: Vec<usize>,
+    /// whether one refused, by more than rounding
+    refused: bool,
     /// planes swept
     planes: u64,
 }
@@ -107,7 +109,8 @@ struct Done {
 /// One propagation: raises sign·u of a component from what was set.
 pub struct Propagation<'a, S: BrickSource + ?Sized> {
     pub rest: &'a S,
-    pub tissue: &'a Tissue,
+    pub model: &'a Model,
+    pub rules: Rules,
     pub elements: &'a mut Elements,
     pub before: &'a mut Before,
     pub scratch: &'a mut Scratch,
@@ -138,9 +141,9 @@ impl<S: BrickSource + ?Sized> Propagation<'_, S> {
         } else {
             self.visit(1, usize::MAX, &mut done);
         }
-        done.refused.sort_unstable();
-        done.refused.dedup();
-        (done.refused, done.planes)
+        done.held.sort_unstable();
+        done.held.dedup();
+        (if done.refused { done.held } else { Vec::new() }, done.planes)
     }
 
     /// Visits bricks, `batch` at a time, until none waits or `visits` of them were made.
@@ -153,11 +156,11 @@ impl<S: BrickSource + ?Sized> Propagation<'_, S> {
                 break;
             }
             visited += due.len();
-            let (elements, component, sign, slack) = (&*self.elements, self.component, self.sign, self.slack);
+            let (elements, component, sign, slack, rules) = (&*self.elements, self.component, self.sign, self.slack, &self.rules);
             let visit = |(tile, &(slot, entered, first)): (&mut Tile, &Due)| {
                 let brick = elements.brick(slot);
                 let (u, sides) = (&brick.displacement.u[component], sides(elements, brick.id, component));
-                tile.visit(&Visited { sign, u, limits: elements.limits(slot), sides, spacing: elements.spacing(), slack, entered, first })
+                tile.visit(&Visited { sign, u, limits: elements.limits(slot), sides, rules, slack, entered, first })
             };
             let tiles = &mut self.scratch.tiles[..due.len()];
             let outcomes: Vec<Outcome> = if due.len() > 1 {
@@ -167,9 +170,10 @@ impl<S: BrickSource + ?Sized> Propagation<'_, S> {
             };
             for (n, (outcome, &(slot, _, first))) in outcomes.iter().zip(&due).enumerate() {
                 done.planes += outcome.planes;
-                if outcome.refused {
-                    done.refused.push(slot);
+                if outcome.held {
+                    done.held.push(slot);
                 }
+                done.refused |= outcome.refused;
                 if !outcome.changed && !first {
                     continue;
                 }
@@ -178,7 +182,7 @@ impl<S: BrickSource + ?Sized> Propagation<'_, S> {
                 let id = brick.id;
                 for (side, value) in outcome.outgoing.into_iter().enumerate() {
                     let (Some(value), Some(neighbour)) = (value, self.elements.neighbour(id, side)) else { continue };
-                    let next = self.elements.load_with_limits(self.rest, self.tissue, neighbour);
+                    let next = self.elements.load_with_limits(self.rest, self.model, neighbour);
                     self.scratch.is_waiting.resize(self.elements.bricks().len(), false);
                     // a brick waits under the best value it has; older entries are skipped when they come up
                     self.scratch.is_waiting[next] = true;
@@ -200,17 +204,14 @@ impl<S: BrickSource + ?Sized> Propagation<'_, S> {
             for side in 0..6 {
                 // bricks that a restart put back have displacements but no limits yet
                 if let Some(loaded) = self.elements.neighbour(id, side).filter(|&n| self.elements.slot(n).is_some()) {
-                    self.elements.load_with_limits(self.rest, self.tissue, loaded);
+                    self.elements.load_with_limits(self.rest, self.model, loaded);
                 }
             }
             let first = entering == SEED;
             let (elements, u) = (&*self.elements, &self.elements.brick(slot).displacement.u[self.component]);
             let sides = sides(elements, id, self.component);
-            let entered = if first {
-                [u16::MAX; 3]
-            } else {
-                Visited::entering(self.sign, u, &elements.limits(slot).offset, &sides, elements.spacing())
-            };
+            let entered =
+                if first { [u16::MAX; 3] } else { Visited::entering(self.sign, u, &elements.limits(slot).offset, &sides, &self.rules) };
             // what was true when the neighbour called may have been settled since
             if entered != [0; 3] {
                 self.before.keep(self.elements, slot, self.component);
@@ -226,7 +227,7 @@ fn sides(elements: &Elements, id: u32, component: usize) -> Sides<'_> {
         let slot = elements.slot(elements.neighbour(id, side)?)?;
         let brick = elements.brick(slot);
         let limits = brick.limits.as_deref()?;
-        Some((&brick.displacement.u[component], &limits.offset))
+        Some((&brick.displacement.u[component], limits))
     })
 }
 

@@ -7,9 +7,15 @@
 //! Two sweeps, up and down, leave nothing to do along their axis: what goes up and comes back has lost a link each way. So a
 //! plane is swept along an axis only where something entered along it, and again only if another axis changed it since.
 //!
-//! Missing links (void, beyond the volume, bricks not loaded) carry v = −∞ or w = ∞ and never raise anything.
+//! Missing links (beyond the volume, bricks not loaded, what voids and cuts do not hold) carry v = −∞ or w = ∞ and never raise
+//! anything. Links that differ by direction along the component's own axis have a second set of limits for the way down.
 
-use crate::{brick::ELEMENTS, state::LimitsBrick, tissue::link_limits};
+use crate::{
+    brick::{DisplacementBrick, ELEMENTS},
+    links::{Rule, Rules},
+    state::LimitsBrick,
+    tissue::link_limits,
+};
 use maille_volume::brick::EDGE;
 use wide::f32x4;
 
@@ -39,6 +45,11 @@ pub struct Tile {
     wj: Box<[[Row; LINKS]; EDGE]>,
     /// limits of the links from plane k − 1 to plane k, by k
     wk: Box<[Plane; LINKS]>,
+    /// the same for the way down, along i or j, and along k; right where `directed`
+    back: Box<[[Row; LINKS]; EDGE]>,
+    back_k: Box<[Plane; LINKS]>,
+    /// the axis whose links differ by direction
+    directed: Option<usize>,
     /// bounds of the rows, by k, and with lanes along j; right where `bounded`
     bound: Box<[[Plane; 2]; EDGE]>,
     /// whether a bound can matter to what is in the tile
@@ -56,8 +67,7 @@ pub struct Visited<'a> {
     pub u: &'a [f32; ELEMENTS],
     pub limits: &'a LimitsBrick,
     pub sides: Sides<'a>,
-    /// [mm]
-    pub spacing: [f32; 3],
+    pub rules: &'a Rules,
     /// rounding that is no refusal [mm]
     pub slack: f32,
     /// where neighbours raise something along each axis, as in [`Visited::entering`]
@@ -69,13 +79,17 @@ pub struct Visited<'a> {
 impl Visited<'_> {
     /// Where a neighbour's face raises an element of the brick: along i and j one bit for each k, along k one for each j. Where none
     /// does, a visit would change nothing.
-    pub fn entering(sign: f32, u: &[f32; ELEMENTS], offset: &[f32; ELEMENTS], sides: &Sides, spacing: [f32; 3]) -> [u16; 3] {
+    /// Cuts and thin tissue are not looked at: where they let go, a visit is made for nothing.
+    pub fn entering(sign: f32, u: &[f32; ELEMENTS], offset: &[f32; ELEMENTS], sides: &Sides, rules: &Rules) -> [u16; 3] {
         let sign = f32x4::splat(sign);
         std::array::from_fn(|axis| {
-            let s = f32x4::splat(spacing[axis]);
             let mut raised = 0;
             for side in [2 * axis, 2 * axis + 1] {
-                let Some((outside, o)) = sides[side] else { continue };
+                let Some((outside, limits)) = sides[side] else { continue };
+                let o = &limits.offset;
+                // from the neighbour below the way is up
+                let rule = rules.side(side ^ 1);
+                let s = f32x4::splat(rule.length);
                 let (here, there) = if side % 2 == 0 { (0, EDGE - 1) } else { (EDGE - 1, 0) };
                 for at in 0..EDGE {
                     let mut raises = f32x4::ZERO;
@@ -86,7 +100,7 @@ impl Visited<'_> {
                             1 => row(plane, x, at)[lane],
                             _ => row(plane, at, x)[lane],
                         };
-                        let w = link_limits(four(offset, here), four(o, there), s);
+                        let w = link_limits(filled(four(offset, here), rule), filled(four(o, there), rule), s);
                         raises |= (sign * four(outside, there) - w).simd_gt(sign * four(u, here));
                     }
                     raised |= u16::from(raises.any()) << at;
@@ -103,14 +117,17 @@ pub struct Outcome {
     pub changed: bool,
     /// planes swept
     pub planes: u64,
-    /// whether a bound refused part of the push
+    /// whether a bound held an element back, and whether by more than rounding: then it refused part of the push
+    pub held: bool,
     pub refused: bool,
     /// for each side the largest value on the face that may raise the neighbour's elements
     pub outgoing: [Option<f32>; 6],
 }
 
-/// What surrounds a brick, per side: displacement and offset planes of the neighbour, if it is loaded.
-pub type Sides<'a> = [Option<(&'a [f32; ELEMENTS], &'a [f32; ELEMENTS])>; 6];
+/// What surrounds a brick, per side: displacement and limits of the neighbour, if it is loaded.
+pub type Sides<'a> = [Option<Side<'a>>; 6];
+/// One neighbour.
+pub type Side<'a> = (&'a [f32; ELEMENTS], &'a LimitsBrick);
 
 #[inline(always)]
 fn row(plane: &[f32; ELEMENTS], j: usize, k: usize) -> Row {
@@ -140,9 +157,24 @@ fn transposed(plane: &[Row]) -> Plane {
     out
 }
 
+/// Offsets with what stands for voids.
 #[inline(always)]
-fn limits(a: &Row, b: &Row, s: f32x4) -> Row {
-    [link_limits(a[0], b[0], s), link_limits(a[1], b[1], s), link_limits(a[2], b[2], s), link_limits(a[3], b[3], s)]
+fn filled(o: f32x4, rule: &Rule) -> f32x4 {
+    if rule.void == f32::INFINITY { o } else { o.simd_eq(f32x4::splat(f32::INFINITY)).bitselect(f32x4::splat(rule.void), o) }
+}
+
+#[inline(always)]
+fn limits(a: &Row, b: &Row, rule: &Rule) -> Row {
+    let s = f32x4::splat(rule.length);
+    std::array::from_fn(|n| link_limits(filled(a[n], rule), filled(b[n], rule), s))
+}
+
+/// Sets one lane.
+#[inline(always)]
+fn set(row: &mut Row, at: usize, value: f32) {
+    let mut lanes = row[at / 4].to_array();
+    lanes[at % 4] = value;
+    row[at / 4] = f32x4::new(lanes);
 }
 
 #[inline(always)]
@@ -152,9 +184,9 @@ fn signed(sign: f32x4, u: Row) -> Row {
 
 /// Copies one row of a neighbour, or of what never raises anything.
 #[inline(always)]
-fn neighbour(v: &mut Row, o: &mut Row, sign: f32x4, side: Option<(&[f32; ELEMENTS], &[f32; ELEMENTS])>, j: usize, k: usize) {
+fn neighbour(v: &mut Row, o: &mut Row, sign: f32x4, side: Option<Side>, j: usize, k: usize) {
     (*v, *o) = match side {
-        Some((u, offset)) => (signed(sign, row(u, j, k)), row(offset, j, k)),
+        Some((u, limits)) => (signed(sign, row(u, j, k)), row(&limits.offset, j, k)),
         None => ([f32x4::splat(f32::NEG_INFINITY); LANES], ROW),
     };
 }
@@ -198,6 +230,9 @@ impl Tile {
             wi: Box::new([[row; LINKS]; EDGE]),
             wj: Box::new([[row; LINKS]; EDGE]),
             wk: Box::new([[row; EDGE]; LINKS]),
+            back: Box::new([[row; LINKS]; EDGE]),
+            back_k: Box::new([[row; EDGE]; LINKS]),
+            directed: None,
             bound: Box::new([[[row; EDGE]; 2]; EDGE]),
             bounded: false,
             offsets: Box::new([[row; T]; T]),
@@ -209,18 +244,18 @@ impl Tile {
     pub fn visit(&mut self, brick: &Visited) -> Outcome {
         self.gather(brick);
         let (changed, planes) = if self.bounded { self.sweep::<true>(brick.entered) } else { self.sweep::<false>(brick.entered) };
-        let refused = self.bounded && self.refused(brick.slack);
+        let (held, refused) = if self.bounded { self.refused(brick.slack) } else { (false, false) };
         // a brick that its neighbours left as it was tells nobody: two elements held at their bounds on either side of a face
         // would wake each other for ever
         let outgoing = if changed || brick.first { self.outgoing(&brick.sides) } else { [None; 6] };
-        Outcome { changed, planes, refused, outgoing }
+        Outcome { changed, planes, held, refused, outgoing }
     }
 
     /// Copies a brick's component, times `sign`, the faces around it, and what its links allow.
     #[inline(always)]
     fn gather(&mut self, brick: &Visited) {
-        let Visited { u, limits: limits_of, sides, .. } = *brick;
-        let (sign, spacing) = (f32x4::splat(brick.sign), brick.spacing.map(f32x4::splat));
+        let Visited { u, limits: limits_of, sides, rules, .. } = *brick;
+        let sign = f32x4::splat(brick.sign);
         for k in 0..EDGE {
             for j in 0..EDGE {
                 self.v[k + 1][j + 1] = signed(sign, row(u, j, k));
@@ -237,30 +272,54 @@ impl Tile {
         }
         for (end, i) in [(0, EDGE - 1), (1, 0)] {
             let (v, o) = (&mut self.ends[end], &mut self.end_offsets[end]);
-            let Some((u, offset)) = sides[end] else {
+            let Some((u, limits)) = sides[end] else {
                 (*v, *o) = ([[f32x4::splat(f32::NEG_INFINITY); LANES]; EDGE], [ROW; EDGE]);
                 continue;
             };
             for n in 0..EDGE * LANES {
                 let four = |plane| column(plane, i, n * 4 * EDGE);
-                (v[n / LANES][n % LANES], o[n / LANES][n % LANES]) = (sign * four(u), four(offset));
+                (v[n / LANES][n % LANES], o[n / LANES][n % LANES]) = (sign * four(u), four(&limits.offset));
             }
         }
+        let up = &rules.up;
         for k in 0..EDGE {
             for j in 0..LINKS {
-                self.wj[k][j] = limits(&self.offsets[k + 1][j], &self.offsets[k + 1][j + 1], spacing[1]);
+                self.wj[k][j] = limits(&self.offsets[k + 1][j], &self.offsets[k + 1][j + 1], &up[1]);
             }
             let o = transposed(&self.offsets[k + 1][1..]);
-            self.wi[k][0] = limits(&self.end_offsets[0][k], &o[0], spacing[0]);
-            for i in 1..EDGE {
-                self.wi[k][i] = limits(&o[i - 1], &o[i], spacing[0]);
-            }
-            self.wi[k][EDGE] = limits(&o[EDGE - 1], &self.end_offsets[1][k], spacing[0]);
+            self.wi[k] = self.row_limits(&o, k, &up[0]);
         }
         for k in 0..LINKS {
             for j in 0..EDGE {
-                self.wk[k][j] = limits(&self.offsets[k][j + 1], &self.offsets[k + 1][j + 1], spacing[2]);
+                self.wk[k][j] = limits(&self.offsets[k][j + 1], &self.offsets[k + 1][j + 1], &up[2]);
             }
+        }
+        self.directed = (0..3).find(|&axis| rules.up[axis] != rules.down[axis]);
+        match self.directed {
+            Some(0) => {
+                for k in 0..EDGE {
+                    let o = transposed(&self.offsets[k + 1][1..]);
+                    self.back[k] = self.row_limits(&o, k, &rules.down[0]);
+                }
+            }
+            Some(1) => {
+                for k in 0..EDGE {
+                    for j in 0..LINKS {
+                        self.back[k][j] = limits(&self.offsets[k + 1][j], &self.offsets[k + 1][j + 1], &rules.down[1]);
+                    }
+                }
+            }
+            Some(_) => {
+                for k in 0..LINKS {
+                    for j in 0..EDGE {
+                        self.back_k[k][j] = limits(&self.offsets[k][j + 1], &self.offsets[k + 1][j + 1], &rules.down[2]);
+                    }
+                }
+            }
+            None => {}
+        }
+        if limits_of.flags.is_some() || sides.iter().flatten().any(|side| side.1.flags.is_some()) {
+            self.flag(limits_of, &sides, rules);
         }
         // nothing rises above the largest value that is there
         self.bounded = self.largest() > limits_of.least_bound;
@@ -272,6 +331,74 @@ impl Tile {
                 self.bound[k][1] = transposed(&self.bound[k][0]);
             }
         }
+    }
+
+    /// Limits of the links along i of the rows of plane k with offsets `o`.
+    #[inline(always)]
+    fn row_limits(&self, o: &Plane, k: usize, rule: &Rule) -> [Row; LINKS] {
+        let mut out = [ROW; LINKS];
+        out[0] = limits(&self.end_offsets[0][k], &o[0], rule);
+        for i in 1..EDGE {
+            out[i] = limits(&o[i - 1], &o[i], rule);
+        }
+        out[EDGE] = limits(&o[EDGE - 1], &self.end_offsets[1][k], rule);
+        out
+    }
+
+    /// Writes the limits of links with a cut or thin end, one by one: they are few.
+    #[cold]
+    fn flag(&mut self, limits_of: &LimitsBrick, sides: &Sides, rules: &Rules) {
+        for axis in 0..3 {
+            for at in 0..EDGE * EDGE {
+                // a: lane or row, b: plane, as the arrays are laid out
+                let (a, b) = (at % EDGE, at / EDGE);
+                let element = |x: usize| match axis {
+                    0 => DisplacementBrick::offset(x, a, b),
+                    1 => DisplacementBrick::offset(a, x, b),
+                    _ => DisplacementBrick::offset(a, b, x),
+                };
+                // position x − 1 of the link's lower end, its upper end x
+                for x in 0..LINKS {
+                    let low = match x {
+                        0 => sides[2 * axis].map_or((0.0, 0), |s| s.1.of(element(EDGE - 1))),
+                        _ => limits_of.of(element(x - 1)),
+                    };
+                    let high = match x {
+                        EDGE => sides[2 * axis + 1].map_or((0.0, 0), |s| s.1.of(element(0))),
+                        _ => limits_of.of(element(x)),
+                    };
+                    if low.1 | high.1 == 0 {
+                        continue;
+                    }
+                    let (up, down) = (rules.up[axis].limit(axis, low, high), rules.down[axis].limit(axis, low, high));
+                    let directed = self.directed == Some(axis);
+                    match axis {
+                        0 => set(&mut self.wi[b][x], a, up),
+                        1 => set(&mut self.wj[b][x], a, up),
+                        _ => set(&mut self.wk[x][b], a, up),
+                    }
+                    match axis {
+                        0 | 1 if directed => set(&mut self.back[b][x], a, down),
+                        2 if directed => set(&mut self.back_k[x][b], a, down),
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
+
+    /// Limits along i or j for the way down, and along k.
+    #[inline(always)]
+    fn back_i(&self) -> &[[Row; LINKS]; EDGE] {
+        if self.directed == Some(0) { &self.back } else { &self.wi }
+    }
+    #[inline(always)]
+    fn back_j(&self) -> &[[Row; LINKS]; EDGE] {
+        if self.directed == Some(1) { &self.back } else { &self.wj }
+    }
+    #[inline(always)]
+    fn back_k(&self) -> &[Plane; LINKS] {
+        if self.directed == Some(2) { &self.back_k } else { &self.wk }
     }
 
     /// Largest value in the tile.
@@ -316,7 +443,7 @@ impl Tile {
         let mut again = [0; 3];
         for k in bits(planes) {
             let mut v = transposed(&self.v[k + 1][1..]);
-            let (w, bound) = (&self.wi[k], &self.bound[k][1]);
+            let (w, back, bound) = (&self.wi[k], &self.back_i()[k], &self.bound[k][1]);
             let mut changed = ROW;
             let mut from = self.ends[0][k];
             for i in 0..EDGE {
@@ -325,7 +452,7 @@ impl Tile {
             }
             let mut from = self.ends[1][k];
             for i in (0..EDGE).rev() {
-                raise::<BOUNDED>(&mut v[i], &from, &w[i + 1], &bound[i], &mut changed);
+                raise::<BOUNDED>(&mut v[i], &from, &back[i + 1], &bound[i], &mut changed);
                 from = v[i];
             }
             // lanes run along j
@@ -344,6 +471,7 @@ impl Tile {
     fn sweep_j<const BOUNDED: bool>(&mut self, planes: u16) -> [u16; 3] {
         let mut again = [0; 3];
         for k in bits(planes) {
+            let back = if self.directed == Some(1) { &self.back[k] } else { &self.wj[k] };
             let (v, w, bound) = (&mut self.v[k + 1], &self.wj[k], &self.bound[k][0]);
             let mut rows = 0;
             let mut from = v[0];
@@ -356,7 +484,7 @@ impl Tile {
             let mut from = v[T - 1];
             for j in (0..EDGE).rev() {
                 let mut changed = ROW;
-                raise::<BOUNDED>(&mut v[j + 1], &from, &w[j + 1], &bound[j], &mut changed);
+                raise::<BOUNDED>(&mut v[j + 1], &from, &back[j + 1], &bound[j], &mut changed);
                 from = v[j + 1];
                 rows |= u16::from(any(&changed)) << j;
             }
@@ -370,6 +498,7 @@ impl Tile {
     #[inline(always)]
     fn sweep_k<const BOUNDED: bool>(&mut self, planes: u16) -> [u16; 3] {
         let mut rows = 0;
+        let back = if self.directed == Some(2) { &self.back_k } else { &self.wk };
         for j in bits(planes) {
             let mut from = self.v[0][j + 1];
             for k in 0..EDGE {
@@ -381,7 +510,7 @@ impl Tile {
             let mut from = self.v[T - 1][j + 1];
             for k in (0..EDGE).rev() {
                 let mut changed = ROW;
-                raise::<BOUNDED>(&mut self.v[k + 1][j + 1], &from, &self.wk[k + 1][j], &self.bound[k][0][j], &mut changed);
+                raise::<BOUNDED>(&mut self.v[k + 1][j + 1], &from, &back[k + 1][j], &self.bound[k][0][j], &mut changed);
                 from = self.v[k + 1][j + 1];
                 rows |= u16::from(any(&changed)) << k;
             }
@@ -399,31 +528,33 @@ impl Tile {
         }
     }
 
-    /// Whether some element would be raised beyond its bound by a link (a bound that refuses part of the push). `slack`
-    /// [mm]: rounding that is no refusal.
+    /// Whether some element would be raised beyond its bound by a link, and whether by more than `slack` [mm], which is rounding and no
+    /// refusal.
     #[inline(always)]
-    fn refused(&self, slack: f32) -> bool {
-        let (mut over, slack) = (f32x4::ZERO, f32x4::splat(slack));
+    fn refused(&self, slack: f32) -> (bool, bool) {
+        let (mut held, mut over, slack) = (f32x4::ZERO, f32x4::ZERO, f32x4::splat(slack));
         let mut test = |from: &Row, w: &Row, bound: &Row| {
             for n in 0..LANES {
-                over |= (from[n] - w[n]).simd_gt(bound[n] + slack);
+                let wanted = from[n] - w[n];
+                held |= wanted.simd_gt(bound[n]);
+                over |= wanted.simd_gt(bound[n] + slack);
             }
         };
         for k in 0..EDGE {
             let [rows, columns] = &self.bound[k];
             for (j, bound) in rows.iter().enumerate() {
                 test(&self.v[k + 1][j], &self.wj[k][j], bound);
-                test(&self.v[k + 1][j + 2], &self.wj[k][j + 1], bound);
+                test(&self.v[k + 1][j + 2], &self.back_j()[k][j + 1], bound);
                 test(&self.v[k][j + 1], &self.wk[k][j], bound);
-                test(&self.v[k + 2][j + 1], &self.wk[k + 1][j], bound);
+                test(&self.v[k + 2][j + 1], &self.back_k()[k + 1][j], bound);
             }
             let v = transposed(&self.v[k + 1][1..]);
             for i in 0..EDGE {
                 test(if i > 0 { &v[i - 1] } else { &self.ends[0][k] }, &self.wi[k][i], &columns[i]);
-                test(if i + 1 < EDGE { &v[i + 1] } else { &self.ends[1][k] }, &self.wi[k][i + 1], &columns[i]);
+                test(if i + 1 < EDGE { &v[i + 1] } else { &self.ends[1][k] }, &self.back_i()[k][i + 1], &columns[i]);
             }
         }
-        over.any()
+        (held.any(), over.any())
     }
 
     /// For each side: the largest v on the face that may raise the neighbour's elements. A neighbour that is not loaded is at rest,
@@ -441,11 +572,11 @@ impl Tile {
                         let i = if side == 0 { 0 } else { EDGE - 1 };
                         let at = |j: usize| self.v[n + 1][j + 1][i / 4].as_array()[i % 4];
                         column = std::array::from_fn(|l| f32x4::new([at(4 * l), at(4 * l + 1), at(4 * l + 2), at(4 * l + 3)]));
-                        (&column, &self.wi[n][if side == 0 { 0 } else { EDGE }], &self.ends[side][n])
+                        (&column, if side == 0 { &self.back_i()[n][0] } else { &self.wi[n][EDGE] }, &self.ends[side][n])
                     }
-                    2 => (&self.v[n + 1][1], &self.wj[n][0], &self.v[n + 1][0]),
+                    2 => (&self.v[n + 1][1], &self.back_j()[n][0], &self.v[n + 1][0]),
                     3 => (&self.v[n + 1][EDGE], &self.wj[n][EDGE], &self.v[n + 1][T - 1]),
-                    4 => (&self.v[1][n + 1], &self.wk[0][n], &self.v[0][n + 1]),
+                    4 => (&self.v[1][n + 1], &self.back_k()[0][n], &self.v[0][n + 1]),
                     _ => (&self.v[EDGE][n + 1], &self.wk[EDGE][n], &self.v[T - 1][n + 1]),
                 };
                 for lane in 0..LANES {

@@ -1,7 +1,7 @@
 //! Independent truth for small cases: Bellman–Ford over every link of the volume, and made tissue.
 #![allow(dead_code, reason = "each test file uses its part")]
 
-use maille_chainmail::{ChainMail, Tissue};
+use maille_chainmail::{AxisLimits, ChainMail, LinkModel, Tissue};
 use maille_volume::{BrickSource, BrickedVolume, Grid, Rescale, Volume};
 
 /// A committed, tiny generator (splitmix64): the same numbers for ever.
@@ -150,4 +150,89 @@ impl Links {
 /// The whole displacement, i fastest.
 pub fn displacement(mail: &ChainMail) -> Vec<[f32; 3]> {
     voxels(mail.layout().size).map(|v| mail.displacement(v)).collect()
+}
+
+/// Links that differ by axis and direction.
+pub fn lopsided() -> LinkModel {
+    LinkModel {
+        axes: [
+            AxisLimits { extension: 0.6, compression: 1.2, shear: 0.9 },
+            AxisLimits { extension: 1.3, compression: 0.5, shear: 1.1 },
+            AxisLimits { extension: 1.0, compression: 0.8, shear: 0.4 },
+        ],
+        ..LinkModel::default()
+    }
+}
+
+/// The links that a mail says it has, one by one: for what has voids, cuts or directions.
+pub mod graph {
+    use super::{ChainMail, voxels};
+    use maille_volume::{BrickSource, BrickedVolume};
+
+    /// Each link of component c: (p, q, how far u(p) may exceed u(q), and the other way).
+    pub fn links(rest: &BrickedVolume, mail: &ChainMail, c: usize) -> Vec<(usize, usize, f32, f32)> {
+        let (size, grid) = (mail.layout().size, &rest.info().grid);
+        let mut out = Vec::new();
+        for p in voxels(size) {
+            for axis in 0..3 {
+                let mut q = p;
+                q[axis] += 1;
+                if q[axis] < size[axis] {
+                    let [over, under] = mail.directed_link(rest, p, axis, c);
+                    out.push((grid.offset(p[0], p[1], p[2]), grid.offset(q[0], q[1], q[2]), over, under));
+                }
+            }
+        }
+        out
+    }
+
+    /// Largest violation of a link beyond a thousandth of its limit [mm], or of a bound.
+    pub fn worst(rest: &BrickedVolume, mail: &ChainMail) -> f64 {
+        let mut worst = 0.0f64;
+        let u: Vec<[f32; 3]> = voxels(mail.layout().size).map(|v| mail.displacement(v)).collect();
+        for c in 0..3 {
+            let plane: Vec<f64> = u.iter().map(|u| f64::from(u[c])).collect();
+            for (p, q, over, under) in links(rest, mail, c) {
+                let difference = plane[p] - plane[q];
+                worst = worst.max(difference - 1.001 * f64::from(over)).max(-difference - 1.001 * f64::from(under));
+            }
+        }
+        for (v, u) in voxels(mail.layout().size).zip(&u) {
+            let bound = f64::from(mail.limits(rest, v).1);
+            worst = u.iter().fold(worst, |w, u| if u.is_finite() { w.max(f64::from(u.abs()) - 1.001 * bound) } else { f64::INFINITY });
+        }
+        worst
+    }
+
+    /// Largest u(p) − u(q) − d(p, q) over all paths, and largest |u(p)| − M(p), by Bellman–Ford.
+    pub fn largest_excess(rest: &BrickedVolume, mail: &ChainMail) -> [f64; 2] {
+        let mut most = [0.0f64; 2];
+        for c in 0..3 {
+            let links = links(rest, mail, c);
+            let start: Vec<f64> = voxels(mail.layout().size).map(|v| f64::from(mail.displacement(v)[c])).collect();
+            let settle = |mut u: Vec<f64>| loop {
+                let before = u.clone();
+                for &(p, q, over, under) in &links {
+                    u[q] = u[q].max(u[p] - f64::from(over));
+                    u[p] = u[p].max(u[q] - f64::from(under));
+                }
+                if u == before {
+                    break u;
+                }
+            };
+            let above = settle(start.clone());
+            most[0] = above.iter().zip(&start).fold(most[0], |m, (a, b)| m.max(a - b));
+            // from below: −M(q) = max over y of −bound(y) − d(y, q)
+            let bound = || voxels(mail.layout().size).map(|v| -f64::from(mail.limits(rest, v).1));
+            let lowest = settle(bound().collect());
+            most[1] = lowest.iter().zip(&start).fold(most[1], |m, (l, u)| m.max(l - u));
+            for &u in &start {
+                assert!(u.is_finite());
+            }
+            // and from above: u(p) − d(p, y) ≤ bound(y)
+            let over = above.iter().zip(bound()).fold(0.0f64, |m, (a, b)| m.max(a + b));
+            most[1] = most[1].max(over);
+        }
+        most
+    }
 }
