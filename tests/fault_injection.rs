@@ -6,10 +6,16 @@
 //! back, haptic goes on ticking through the deaths of the others, restarts are counted right, nothing is left in /dev/shm.
 //!
 //! `MAILLE_SEED=7` gives another schedule; the long version is `MAILLE_FAULTS=300 cargo test --test fault_injection -- --nocapture`.
+//! What the hand feels meanwhile is `hand`'s matter.
 
 #[path = "../services/supervisor/tests/support/mod.rs"]
 #[allow(dead_code)] // shared with other tests, which use other parts
 mod support;
+
+#[path = "fault_injection/device.rs"]
+mod device;
+#[path = "fault_injection/hand.rs"]
+mod hand;
 
 use maille_contract::{Role, ServiceState, ToolState, control::Counter};
 use maille_store::{FREE_PINS, Reader, Snapshot};
