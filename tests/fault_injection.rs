@@ -1,5 +1,5 @@
-//! Faults in a whole run: services killed, killed in pairs, killed while they start, stopped and continued, at seeded random instants,
-//! while a scripted tip presses into tissue.
+//! Faults in a whole run: services killed, killed in pairs, killed while they start, stopped and continued, at seeded random instants, and
+//! killed at named points inside transaction, commit, pin, reclaim and recovery, while a scripted tip presses into tissue.
 //!
 //! A witness beside the run (pins of its own) looks at the committed tissue all the time: one epoch always has the same bytes, whoever
 //! died meanwhile; epochs never go back; a snapshot that it holds across a death stays as it was. Asked besides: every service comes
@@ -18,7 +18,10 @@ mod device;
 mod hand;
 
 use maille_contract::{Role, ServiceState, ToolState, control::Counter};
-use maille_store::{FREE_PINS, Reader, Snapshot};
+use maille_store::{
+    FREE_PINS, Reader, Snapshot,
+    fault::{Action, Faults, Point},
+};
 use maille_transport::{ControlMap, Domain};
 use maille_volume::BrickSource;
 use rustix::process::Signal;
@@ -101,6 +104,40 @@ fn until(what: &str, run: &Run, holds: impl Fn() -> bool) {
     }
 }
 
+/// A named point at which a service can be told to die, and how often it passes there before it does.
+fn point(role: Role, random: &mut Random) -> (Point, &'static str, u32) {
+    let points: &[(Point, &str)] = match role {
+        Role::Deformation => &Point::OF_WRITER,
+        _ => &Point::OF_READER,
+    };
+    let (point, name) = points[random.below(points.len() as u64) as usize];
+    // recovery is passed once in a life
+    let once = matches!(point, Point::Recovering | Point::Recovered);
+    (point, name, if once { 1 } else { 1 + random.below(6) as u32 })
+}
+
+/// Lets a service die at a named point, its successors as well where that is in recovery, and waits until it is back.
+fn die_at(
+    run: &Run,
+    control: &ControlMap,
+    faults: &Faults,
+    role: Role,
+    (point, name, passes): (Point, &str, u32),
+    kills: &mut BTreeMap<Role, u64>,
+) {
+    let cell = control.service(role);
+    let incarnation = cell.incarnation.load(Relaxed);
+    faults.arm(role, point, passes, Action::Kill);
+    let mut deaths = 1;
+    if matches!(point, Point::Recovering | Point::Recovered) {
+        signal(pid(control, role), Signal::KILL);
+        deaths = 2;
+    }
+    until(&format!("{} comes to {name} for the {passes}th time", role.word()), run, || !faults.is_armed(role));
+    until("who died at a named point is back", run, || cell.incarnation.load(Relaxed) >= incarnation + deaths && ready(control, role));
+    *kills.entry(role).or_default() += deaths;
+}
+
 /// Kills services together and waits until all are back.
 fn kill(run: &Run, control: &ControlMap, roles: &[Role], back: &mut Vec<Back>, kills: &mut BTreeMap<Role, u64>) {
     let before: Vec<u64> = roles.iter().map(|&r| control.service(r).incarnation.load(Relaxed)).collect();
@@ -125,7 +162,10 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
     let mut random = Random(number("MAILLE_SEED", 1));
     let scratch = Scratch::new("faults");
     let path = scratch.file("run.json");
-    let scene = scratch.write("small.toml", SMALL_SCENE);
+    // tissue that comes back keeps the writer at work: transactions all the time
+    let relaxing =
+        SMALL_SCENE.replace("deformation = true", "deformation = true\nrelaxation = true") + "[deformation]\nrelaxation_s = 0.2\n";
+    let scene = scratch.write("small.toml", &relaxing);
     let command = &mut Command::new(env!("CARGO_BIN_EXE_maille"));
     let mut run = Run::start(command.arg("run").arg(scene).args(["--headless", "--report", path.to_str().expect("a path in UTF-8")]));
     let domain = run.domain();
@@ -139,6 +179,8 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
     let own = Reader::open_with_pins(&shared, FREE_PINS.start..half).expect("the store");
     let others = Reader::open_with_pins(&shared, half..FREE_PINS.end).expect("the store");
     until("tissue gives way", &run, || own.epoch() > 2);
+    let points = Faults::open(&shared).expect("the test build has points");
+    let mut named: BTreeMap<&str, u64> = BTreeMap::new();
 
     let (stop, mut back, mut kills) = (AtomicBool::new(false), Vec::new(), BTreeMap::new());
     let mut stops = 0;
@@ -150,7 +192,7 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
             let held = own.snapshot();
             let shown = fingerprint(&held);
             let role = SERVICES[random.below(3) as usize];
-            match if n < 4 { n } else { random.below(4) } {
+            match if n < 5 { n } else { random.below(6) } {
                 0 => kill(&run, &control, &[role], &mut back, &mut kills),
                 1 => {
                     let others: Vec<Role> = SERVICES.into_iter().filter(|&r| r != role).collect();
@@ -162,6 +204,12 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
                     std::thread::sleep(Duration::from_millis(200 + random.below(700)));
                     signal(stopped, Signal::CONT);
                     stops += 1;
+                }
+                3 | 5 => {
+                    let role = if n == 3 { Role::Deformation } else { role };
+                    let point = point(role, &mut random);
+                    *named.entry(point.1).or_default() += 1;
+                    die_at(&run, &control, &points, role, point, &mut kills);
                 }
                 _ => {
                     // killed, and its successor killed somewhere in its start
@@ -198,6 +246,7 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
         let restarts = report["services"][role.word()]["restarts"].as_u64();
         assert_eq!(restarts, Some(*kills.get(&role).unwrap_or(&0)), "{}: {}", role.word(), run.printed());
     }
+    println!("died at named points: {named:?}");
     println!("{faults} faults, {stops} of them stops; {looks} snapshots of {epochs} epochs; haptic at {rate:.1} Hz while recorded");
     assert!(looks > 100 && epochs > 3, "{looks} snapshots of {epochs} epochs");
 }
