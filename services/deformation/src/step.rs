@@ -76,7 +76,8 @@ impl Engine {
                 Push::Clamp => Admission::ByComponent,
             },
         };
-        let map = MapOptions { tolerance: (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32, void_hu: VOID_HU };
+        let tolerance = (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32;
+        let map = MapOptions { tolerance, void_hu: VOID_HU, ..MapOptions::default() };
         let state = State { version: VERSION, threshold_hu: d.threshold_hu, pushes: 0, last_move: Stamp::default(), last_step_ns: 0 };
         let relaxation_s = scene.has_effect("relaxation").then_some(d.relaxation_s);
         Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, mapper: Mapper::new(), relaxation_s }

@@ -1,9 +1,13 @@
 //! Displaced elements → voxels.
 //!
-//! The voxel at x takes the rest value at X with X + u(X) = x, sampled trilinearly and rounded. Only voxels whose
-//! pre-image may have changed are solved ([`rows`]); everything else keeps its bits. Where a link limit above one third, a
-//! void or a cut folds or opens the map and the kernel does not converge, the cells around are searched; a voxel in no
-//! tissue cell, or with its pre-image outside the grid, becomes void.
+//! The voxel at x takes the rest value at X with X + u(X) = x, sampled ([`Sampling`]) and rounded. Only voxels whose
+//! pre-image may have changed are solved ([`rows`]); everything else keeps its bits.
+//!
+//! Beside voids (below the tissue's threshold) and cuts ([`CutLinks`]) the map is taken apart into pieces of tissue ([`pieces`]): a cell
+//! that a cut crosses is never interpolated across, a surface moves with the tissue it belongs to. There, and where limits of a third
+//! and more fold the map, the cells around are searched; folded cells are counted. A voxel in the image of no tissue is void
+//! (`void_hu`): what opened is a gap of air; a void that nothing entered or left keeps its own values. A pre-image outside the grid is
+//! void as well.
 //!
 //! Units: grid index units inside, mm and HU at the border. Invariants: aprons and skip cells of every brick that shows a
 //! changed voxel are right when [`remap`] returns; the result does not depend on the number of threads. Cost: one small
@@ -11,6 +15,7 @@
 
 #![forbid(unsafe_code)]
 
+mod pieces;
 mod reach;
 mod rows;
 mod sample;
@@ -19,6 +24,9 @@ mod solve;
 pub mod tetrahedra;
 mod window;
 mod write;
+
+pub use pieces::CutLinks;
+pub use sample::Sampling;
 
 use maille_chainmail::{ChainMail, ChangedRegion};
 use maille_displacement::Inverter;
@@ -57,12 +65,30 @@ pub struct MapOptions {
     pub tolerance: f32,
     /// value of a voxel without pre-image in tissue [HU]
     pub void_hu: f64,
+    /// interpolation of rest values
+    pub sampling: Sampling,
+    /// how pre-images are found
+    pub mapping: Mapping,
+}
+
+/// How pre-images are found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Mapping {
+    /// the inversion kernel: fixed point for offsets up to 0.2, Newton above
+    #[default]
+    Inverse,
+    /// the kernel by fixed point
+    FixedPoint,
+    /// the kernel by damped Newton
+    Newton,
+    /// search among tetrahedra [Dräger 2005]: [`tetrahedra`], for comparison; trilinear within tetrahedra whatever `sampling` says
+    Tetrahedra(tetrahedra::Split),
 }
 
 impl Default for MapOptions {
     /// A hundredth of a voxel: a few HU at the steepest edges of bone. Voids are air.
     fn default() -> Self {
-        Self { tolerance: 0.01, void_hu: -1000.0 }
+        Self { tolerance: 0.01, void_hu: -1000.0, sampling: Sampling::Linear, mapping: Mapping::Inverse }
     }
 }
 
@@ -81,6 +107,8 @@ pub struct MapReport {
     pub voids: u64,
     /// voxels for which nothing converged: they took the best position found
     pub failures: u64,
+    /// cells turned over; counted where limits of a third and more, voids or cuts allow it
+    pub folded: u64,
 }
 
 impl MapReport {
@@ -91,6 +119,7 @@ impl MapReport {
         self.searched += other.searched;
         self.voids += other.voids;
         self.failures += other.failures;
+        self.folded += other.folded;
         self
     }
 }
@@ -110,6 +139,8 @@ pub struct Mapper {
     values: Vec<Values>,
     /// one a thread, taken and put back
     workspaces: Mutex<Vec<Workspace>>,
+    /// beside voids and cuts: for each brick the range of displacements [mm] when it was mapped last
+    seen: Vec<rows::Range>,
 }
 
 impl Mapper {
@@ -118,19 +149,56 @@ impl Mapper {
         Self::default()
     }
 
+    /// A mapper for voxels that show the displacements of `mail` already, as after a restart: beside voids and cuts it must know what tissue
+    /// will leave.
+    pub fn resume(mail: &ChainMail) -> Self {
+        let seen = (0..mail.layout().count()).map(|id| mail.displacement_range(id as BrickId)).collect();
+        Self { seen, ..Self::default() }
+    }
+
     /// Rewrites the voxels whose pre-image the changed elements may have changed. Runs on rayon's current pool.
     pub fn remap<S, K>(&mut self, rest: &S, mail: &ChainMail, region: &ChangedRegion, sink: &mut K, options: &MapOptions) -> MapReport
     where
         S: BrickSource + ?Sized,
         K: BrickSink + ?Sized,
     {
-        let Self { wanted, parts, values, workspaces } = self;
+        self.remap_cut(rest, mail, None, region, sink, options)
+    }
+
+    /// The same in tissue with cut links. Elements beside a link that was cut since the last mapping need not be in `region`: a cut shows when
+    /// something moves.
+    pub fn remap_cut<S, K>(
+        &mut self,
+        rest: &S,
+        mail: &ChainMail,
+        cuts: Option<&dyn CutLinks>,
+        region: &ChangedRegion,
+        sink: &mut K,
+        options: &MapOptions,
+    ) -> MapReport
+    where
+        S: BrickSource + ?Sized,
+        K: BrickSink + ?Sized,
+    {
+        if let Mapping::Tetrahedra(split) = options.mapping {
+            return tetrahedra::remap(rest, mail, region, sink, split);
+        }
+        let gaps = cuts.is_some() || mail.tissue().threshold_hu.is_some();
+        let Self { wanted, parts, values, workspaces, seen } = self;
         let lend = || Lent::take(workspaces);
 
         // 1. which voxels: each changed brick covers its part
         wanted.clear(mail.layout());
         let threads = rayon::current_num_threads();
-        if threads == 1 || region.bricks.len() < SHARED_CHANGES {
+        if gaps {
+            seen.resize(mail.layout().count(), [[0.0; 2]; 3]);
+            for changed in &region.bricks {
+                wanted.add_beside_gaps(mail, changed, seen);
+            }
+            for id in region.ids() {
+                seen[id as usize] = mail.displacement_range(id);
+            }
+        } else if threads == 1 || region.bricks.len() < SHARED_CHANGES {
             let mut work = lend();
             for changed in &region.bricks {
                 wanted.add(mail, changed, &mut work.get().window);
@@ -151,7 +219,7 @@ impl Mapper {
         }
 
         // 2. their values, brick by brick
-        let solver = Solver::new(rest, mail, options);
+        let solver = Solver::new(rest, mail, cuts, options);
         if values.len() < wanted.ids.len() {
             values.resize(wanted.ids.len(), [0; _]);
         }

@@ -17,6 +17,9 @@ pub struct Box3 {
     pub high: [usize; 3],
 }
 
+/// Smallest and largest displacement, by component.
+pub type Range = [[f32; 2]; 3];
+
 /// Rows of a brick.
 pub const ROWS: usize = EDGE * EDGE;
 
@@ -100,12 +103,30 @@ impl Cover {
         }
     }
 
+    /// The same beside voids and cuts, where the map is not one-to-one: what the changed elements held when they were mapped last is left,
+    /// so that their displacements of then, `seen` [mm] brick by brick, count as well.
+    pub fn add_beside_gaps(&mut self, mail: &ChainMail, changed: &ChangedBrick, seen: &[Range]) {
+        let layout = *mail.layout();
+        let Some((low, high)) = bounds(&changed.spans) else { return };
+        let first = layout.first_voxel(changed.id);
+        let u = displacement_box(mail, first, low, high, seen);
+        match dilation(u) {
+            Some(by) => self.add_dilated(&layout, changed, first, (low, high), by),
+            None => {
+                let end = |at: [usize; 3], side: usize, by: f32| {
+                    f32x4::new([at[0] as f32 + by + u[0][side], at[1] as f32 + by + u[1][side], at[2] as f32 + by + u[2][side], 0.0])
+                };
+                self.add_box(&layout, first, [end(low, 0, -1.0), end(high, 1, 1.0)]);
+            }
+        }
+    }
+
     /// Adds the voxels that the changed elements of one brick may have given a new pre-image.
     pub fn add(&mut self, mail: &ChainMail, changed: &ChangedBrick, window: &mut Window) {
         let layout = *mail.layout();
         let Some((low, high)) = bounds(&changed.spans) else { return };
         let (first, last) = (layout.first_voxel(changed.id), layout.size.map(|s| s - 1));
-        if let Some(by) = dilation(mail, first, low, high) {
+        if let Some(by) = dilation(displacement_box(mail, first, low, high, &[])) {
             return self.add_dilated(&layout, changed, first, (low, high), by);
         }
         // elements low − 1 … high + 1 are corners of the touched cells low − 1 … high
@@ -237,26 +258,32 @@ impl Cover {
     }
 }
 
-/// By how much the spans of a brick's changed elements, in a box, are to be dilated; `None`: displacements are too large or too
-/// different for that to be tight.
-///
-/// The touched cells have corners s − 1 … s + 1 around a changed element s, so their images lie in s − 1 + u_low … s + 1 + u_high.
-fn dilation(mail: &ChainMail, first: [usize; 3], low: [usize; 3], high: [usize; 3]) -> Option<[[isize; 2]; 3]> {
+/// Smallest and largest displacement [voxels] of the bricks that hold a box of elements and its neighbours, now and as `seen` [mm].
+fn displacement_box(mail: &ChainMail, first: [usize; 3], low: [usize; 3], high: [usize; 3], seen: &[Range]) -> Range {
     let (layout, spacing) = (mail.layout(), mail.spacing());
-    let mut by = [[0.0f32; 2]; 3];
+    let mut out = [[0.0f32; 2]; 3];
     let bricks = |c: usize| (first[c] + low[c]).saturating_sub(1) / EDGE..=(first[c] + high[c] + 1).min(layout.size[c] - 1) / EDGE;
     for bk in bricks(2) {
         for bj in bricks(1) {
             for bi in bricks(0) {
-                let range = mail.displacement_range(layout.id([bi, bj, bk]));
-                for c in 0..3 {
-                    by[c] = [by[c][0].min(range[c][0] / spacing[c]), by[c][1].max(range[c][1] / spacing[c])];
+                let id = layout.id([bi, bj, bk]);
+                for range in [Some(&mail.displacement_range(id)), seen.get(id as usize)].into_iter().flatten() {
+                    for c in 0..3 {
+                        out[c] = [out[c][0].min(range[c][0] / spacing[c]), out[c][1].max(range[c][1] / spacing[c])];
+                    }
                 }
             }
         }
     }
+    out
+}
+
+/// By how much spans of changed elements are to be dilated; `None`: their displacements [voxels] are too large for that to be tight.
+///
+/// The touched cells have corners s − 1 … s + 1 around a changed element s, so their images lie in s − 1 + u_low … s + 1 + u_high.
+fn dilation(u: Range) -> Option<[[isize; 2]; 3]> {
     let near = |v: f32| v.abs() < (REACH - 1) as f32;
-    by.iter().flatten().all(|&v| near(v)).then(|| by.map(|[l, h]| [(l - SLACK).ceil() as isize - 1, (h + SLACK).floor() as isize + 1]))
+    u.iter().flatten().all(|&v| near(v)).then(|| u.map(|[l, h]| [(l - SLACK).ceil() as isize - 1, (h + SLACK).floor() as isize + 1]))
 }
 
 /// Union of spans, row by row.

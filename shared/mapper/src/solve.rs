@@ -5,11 +5,12 @@
 //! elements are all at rest need no solve: X = x.
 
 use crate::{
-    MapOptions, MapReport,
-    reach::preimage_box,
+    MapOptions, MapReport, Mapping,
+    pieces::{CutLinks, Pieces},
+    reach::{preimage_box, preimage_box_beside_gaps},
     rows::{Box3, ROWS, Spans, bounds},
-    sample::RestSampler,
-    search,
+    sample::{RestSampler, Sampling},
+    search::{self, Open, OpenVoxels},
     window::Window,
 };
 use maille_chainmail::{ChainMail, DisplacementBrick};
@@ -27,28 +28,49 @@ pub struct Workspace {
     open: Box<Spans>,
     /// x − X of the rows solved [voxels]
     found: Box<[[f32x4; EDGE]; ROWS]>,
+    /// tissue and cuts around, where there are any
+    pieces: Pieces,
+    /// voxels left to the search of cells
+    left: OpenVoxels,
 }
 
 impl Workspace {
     pub fn new() -> Self {
-        Self { window: Window::new(), open: Box::new([[0; 2]; ROWS]), found: Box::new([[f32x4::ZERO; EDGE]; ROWS]) }
+        Self {
+            window: Window::new(),
+            open: Box::new([[0; 2]; ROWS]),
+            found: Box::new([[f32x4::ZERO; EDGE]; ROWS]),
+            pieces: Pieces::default(),
+            left: OpenVoxels::new(),
+        }
     }
 }
 
 /// What stays the same for all bricks of one mapping.
 pub struct Solver<'a, S: BrickSource + ?Sized> {
-    pub rest: &'a S,
-    pub mail: &'a ChainMail,
-    pub inverter: Inverter,
+    rest: &'a S,
+    mail: &'a ChainMail,
+    cuts: Option<&'a dyn CutLinks>,
+    inverter: Inverter,
+    options: MapOptions,
+    /// beside voids and cuts: bricks that hold displacements
+    loaded: Vec<BrickId>,
     /// stored value of what is void
     void: i16,
 }
 
 impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
-    pub fn new(rest: &'a S, mail: &'a ChainMail, options: &MapOptions) -> Self {
+    pub fn new(rest: &'a S, mail: &'a ChainMail, cuts: Option<&'a dyn CutLinks>, options: &MapOptions) -> Self {
         let void = rest.info().rescale.stored(options.void_hu).round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16;
-        let inverter = Inverter::for_offset(mail.tissue().offset, options.tolerance).on_spacing(mail.spacing());
-        Self { rest, mail, inverter, void }
+        let mut inverter = Inverter::for_offset(mail.tissue().offset, options.tolerance).on_spacing(mail.spacing());
+        match options.mapping {
+            Mapping::FixedPoint => inverter.scheme = Scheme::FixedPoint,
+            Mapping::Newton => inverter.scheme = Scheme::Newton,
+            _ => {}
+        }
+        let gaps = cuts.is_some() || mail.tissue().threshold_hu.is_some();
+        let loaded = if gaps { mail.loaded_bricks() } else { Vec::new() };
+        Self { rest, mail, cuts, inverter, options: *options, loaded, void }
     }
 
     /// Solves the wanted voxels of a brick.
@@ -58,7 +80,9 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         let displacement = self.mail.displacement_brick(id).filter(|_| self.mail.displacement_range(id) != [[0.0; 2]; 3]);
         // 1. rest values everywhere; what is left are the rows whose elements moved
         let (rest, values) = (self.rest.brick(id), values.as_chunks_mut::<EDGE>().0);
-        let all_linked = self.mail.tissue().threshold_hu.is_none();
+        let threshold = self.mail.tissue().threshold_hu;
+        let all_linked = threshold.is_none() && self.cuts.is_none();
+        let may_fold = !all_linked || self.mail.tissue().offset >= 1.0 / 3.0;
         for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
             let from = Brick::offset(0, (row % EDGE) as isize, (row / EDGE) as isize);
             values[row].copy_from_slice(&rest.voxels[from..from + EDGE]);
@@ -66,18 +90,26 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         }
         let open = &mut *work.open;
         for (row, span) in spans.iter().enumerate() {
-            open[row] = if all_linked { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) } else { *span };
+            // a void may be entered by others
+            open[row] = if threshold.is_none() { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) } else { *span };
         }
         let Some((low, high)) = bounds(open) else { return report };
         let voxels = Box3 { low: std::array::from_fn(|c| first[c] + low[c]), high: std::array::from_fn(|c| first[c] + high[c]) };
-        work.window.gather(self.mail, preimage_box(self.mail, voxels));
+        let range = if all_linked { preimage_box(self.mail, voxels) } else { preimage_box_beside_gaps(self.mail, voxels, &self.loaded) };
+        work.window.gather(self.mail, range);
         if work.window.at_rest() {
             return report;
         }
-        let (window, found) = (&work.window, &mut *work.found);
+        let (window, found, pieces, left) = (&work.window, &mut *work.found, &mut work.pieces, &mut work.left);
+        if may_fold {
+            pieces.gather(self.rest, threshold, self.cuts, window);
+        } else {
+            pieces.all_tissue(window);
+        }
         let origin = window.low();
-        let mut sampler = RestSampler::new(self.rest, origin, window.size());
+        let mut sampler = RestSampler::new(self.rest, origin, window.size(), self.options.sampling);
         let local: [f32; 3] = std::array::from_fn(|c| first[c] as f32 - origin[c] as f32);
+        let linear = self.options.sampling == Sampling::Linear;
         let (mut target, mut position, mut converged) = ([f32x4::ZERO; EDGE], [f32x4::ZERO; EDGE], [false; EDGE]);
         for (row, span) in open.iter().enumerate().filter(|(_, s)| s[1] > 0) {
             let range = span[0] as usize..span[1] as usize;
@@ -96,26 +128,84 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             for i in range.clone() {
                 found[row][i] = target[i] - position[i];
             }
-            // 3. values; the few that did not converge, and all beside voids, one by one
-            let easy = all_linked && converged[range.clone()].iter().all(|&c| c);
+            // 3. values. X = x is the exact pre-image of what did not move; the kernel stops within its tolerance of it
+            let still = |i: usize| f32x4::new(own[i - range.start]).simd_eq(f32x4::ZERO).to_bitmask() == 0b1111;
+            if all_linked && linear && converged[range.clone()].iter().all(|&c| c) {
+                for i in range.clone().filter(|&i| !still(i)) {
+                    let value = sampler.linear(position[i]);
+                    report.voids += u64::from(value.is_none());
+                    out[i] = value.unwrap_or(self.void);
+                }
+                continue;
+            }
+            // the few that did not converge, and what lies beside voids and cuts, are left
             for i in range.clone() {
-                let voxel = [first[0] + i, first[1] + j, first[2] + k];
-                // X = x is the exact pre-image of what did not move; the kernel stops within its tolerance of it
-                let still = f32x4::new(own[i - range.start]).simd_eq(f32x4::ZERO).to_bitmask() == 0b1111;
-                if still && (all_linked || self.is_tissue(out[i])) {
+                if still(i) && self.is_tissue(out[i]) {
                     continue;
                 }
-                let value = if easy {
-                    sampler.stored(position[i])
+                let (target, near) = (xyz(target[i]), position[i]);
+                let near = if converged[i] { near } else { self.damped(window, target, &mut report) };
+                if near.to_array()[3] == 0.0 && (all_linked || pieces.is_whole(xyz(near))) {
+                    let value = sampler.stored(near);
+                    report.voids += u64::from(value.is_none());
+                    out[i] = value.unwrap_or(self.void);
                 } else {
-                    let hard = Hard { solver: self, window, voxel, target: xyz(target[i]) };
-                    hard.value(&mut sampler, xyz(position[i]), converged[i], &mut report)
-                };
-                report.voids += u64::from(value.is_none());
-                out[i] = value.unwrap_or(self.void);
+                    left.add(Open::new([i, j, k], target, xyz(near)));
+                }
             }
         }
+        // 4. the search
+        if may_fold {
+            report.folded = self.folded(first, open, window, pieces);
+        }
+        report.searched = left.all.len() as u64;
+        left.search(window, pieces, local, self.inverter.stop());
+        for voxel in &left.all {
+            let [i, j, k] = voxel.at.map(usize::from);
+            let out = &mut values[k * EDGE + j][i];
+            let value = match voxel.found() {
+                Some(position) => sampler.stored(register(position)),
+                // tissue without voids and cuts has no gaps: the best position there is
+                None if all_linked => {
+                    report.failures += 1;
+                    sampler.stored(register(voxel.near))
+                }
+                // deep in a void nothing changed; what tissue left, or its surface, is void now
+                None => {
+                    let deep =
+                        !self.is_tissue(*out) && !pieces.is_near_tissue(std::array::from_fn(|c| first[c] + [i, j, k][c] - origin[c]));
+                    deep.then_some(*out)
+                }
+            };
+            report.voids += u64::from(value.is_none());
+            *out = value.unwrap_or(self.void);
+        }
+        left.clear();
         report
+    }
+
+    /// Damped Newton from the voxel's own displacement; the fourth lane is not 0 where it did not converge.
+    #[cold]
+    fn damped(&self, window: &Window, target: [f32; 3], report: &mut MapReport) -> f32x4 {
+        let inverter = Inverter { scheme: Scheme::Newton, ..self.inverter };
+        let u = window.displacement(target);
+        let found = inverter.invert(window, target, std::array::from_fn(|c| target[c] - u[c]));
+        report.iterations += u64::from(found.iterations);
+        let [x, y, z] = found.position;
+        f32x4::new([x, y, z, if found.converged { 0.0 } else { 1.0 }])
+    }
+
+    /// Folded cells among those whose lower corner is to be solved.
+    fn folded(&self, first: [usize; 3], open: &Spans, window: &Window, pieces: &Pieces) -> u64 {
+        let (low, size) = (window.low(), window.size());
+        let mut count = 0;
+        for (row, span) in open.iter().enumerate() {
+            for i in span[0] as usize..span[1] as usize {
+                let base: [usize; 3] = std::array::from_fn(|c| first[c] + [i, row % EDGE, row / EDGE][c] - low[c]);
+                count += u64::from((0..3).all(|c| base[c] + 2 <= size[c]) && search::is_folded(window, pieces, base));
+            }
+        }
+        count
     }
 
     /// Whether a stored value is one of tissue: a void may be entered by others.
@@ -181,43 +271,9 @@ fn xyz(v: f32x4) -> [f32; 3] {
     [x, y, z]
 }
 
-/// A voxel that the row's kernel did not settle, or that may lie beside a void.
-struct Hard<'a, 's, S: BrickSource + ?Sized> {
-    solver: &'a Solver<'s, S>,
-    window: &'a Window,
-    voxel: [usize; 3],
-    target: [f32; 3],
-}
-
-impl<S: BrickSource + ?Sized> Hard<'_, '_, S> {
-    /// Its value; `None`: void.
-    fn value(&self, sampler: &mut RestSampler<S>, mut position: [f32; 3], mut converged: bool, report: &mut MapReport) -> Option<i16> {
-        let threshold = self.solver.mail.tissue().threshold_hu;
-        if !converged {
-            // damped Newton from the voxel's own displacement
-            let inverter = Inverter { scheme: Scheme::Newton, ..self.solver.inverter };
-            let u = self.window.displacement(self.target);
-            let found = inverter.invert(self.window, self.target, std::array::from_fn(|c| self.target[c] - u[c]));
-            report.iterations += u64::from(found.iterations);
-            (position, converged) = (found.position, found.converged);
-        }
-        if !converged || threshold.is_some_and(|t| !sampler.is_tissue_cell(position, t)) {
-            // void or fold: look for a tissue cell whose image holds the voxel
-            report.searched += 1;
-            let mut tissue = |p: [f32; 3]| threshold.is_none_or(|t| sampler.is_tissue_cell(p, t));
-            match search::cell(self.window, self.target, position, self.solver.inverter.stop(), &mut tissue) {
-                Some(better) => position = better.position,
-                // a void that nothing entered keeps its value, one that tissue left is void
-                None if threshold.is_some() => {
-                    let still = self.window.displacement(self.target) == [0.0; 3];
-                    return still.then(|| self.solver.rest.voxel(self.voxel[0], self.voxel[1], self.voxel[2]));
-                }
-                None if !converged => report.failures += 1,
-                None => {}
-            }
-        }
-        sampler.stored(f32x4::new([position[0], position[1], position[2], 0.0]))
-    }
+#[inline(always)]
+fn register([x, y, z]: [f32; 3]) -> f32x4 {
+    f32x4::new([x, y, z, 0.0])
 }
 
 /// A row's elements are bits of a word.

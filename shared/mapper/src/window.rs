@@ -109,6 +109,17 @@ impl Window {
         [x, y, z]
     }
 
+    /// Displacements [voxels] of the corners of a cell, local.
+    #[inline(always)]
+    pub fn corners(&self, [i, j, k]: [usize; 3]) -> [[f32; 3]; 8] {
+        let (row, slice) = (self.size[0], self.size[0] * self.size[1]);
+        let at = k * slice + j * row + i;
+        std::array::from_fn(|n| {
+            let [x, y, z, _] = self.u[at + (n & 1) + (n >> 1 & 1) * row + (n >> 2) * slice];
+            [x, y, z]
+        })
+    }
+
     /// Displacements [voxels] of a row of elements, local.
     #[inline(always)]
     pub fn row(&self, j: usize, k: usize) -> &[[f32; 4]] {
