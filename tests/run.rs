@@ -125,14 +125,24 @@ fn a_killed_service_comes_back_and_the_others_keep_their_processes() {
 #[test]
 fn services_end_with_a_killed_supervisor_and_clean_removes_the_rest() {
     let scratch = Scratch::new("run-orphans");
-    let mut run = start(&scratch, &["--headless"]);
-    let domain = run.domain();
-    let pids = SERVICES.map(|role| run.service(role, 1));
-    std::thread::sleep(Duration::from_millis(1_500));
-    signal(run.pid(), Signal::KILL);
-    run.wait();
-    let time = eventually("the services are gone", || pids.iter().all(|&pid| !lives(pid)));
-    assert!(time < Duration::from_secs(5), "their own bound is 0.7 s; a busy machine may stretch it, not to {time:?}");
+    // Within a second; a machine that does much else may delay one of three tries.
+    let mut domain = String::new();
+    let times: Vec<Duration> = (0..3)
+        .map_while(|tried| {
+            let mut run = start(&scratch, &["--headless"]);
+            let orphans = run.domain();
+            assert!(domain.is_empty() || left_over(&domain).is_empty(), "a new run has not removed what the dead one left");
+            let pids = SERVICES.map(|role| run.service(role, 1));
+            std::thread::sleep(Duration::from_millis(1_500));
+            signal(run.pid(), Signal::KILL);
+            let time = eventually("the services are gone", || pids.iter().all(|&pid| !lives(pid)));
+            run.wait();
+            println!("supervisor killed: services gone after {:.0} ms", time.as_secs_f64() * 1e3);
+            domain = orphans;
+            (tried == 0 || time >= Duration::from_secs(1)).then_some(time)
+        })
+        .collect();
+    assert!(times.len() < 3 || times.iter().any(|&time| time < Duration::from_secs(1)), "services outlived their supervisor by {times:?}");
 
     // a run that lives is left alone by `clean`
     let mut living = start(&scratch, &["--headless"]);
