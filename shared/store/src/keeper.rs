@@ -46,6 +46,9 @@ impl StoreKeeper {
     /// When shared memory cannot be had; the error says how much is needed.
     pub fn create(domain: &Domain, volume: &Volume, sizes: StoreSizes, progress: impl Fn(f64) + Sync) -> Result<Self, StoreError> {
         let layout = index_layout(&volume.info, sizes);
+        if let Some(c) = layout.channels.iter().find(|c| c.slot_count >= u64::from(ABSENT)) {
+            return Err(StoreError::Slots { asked: c.slot_count, most: ABSENT - 1 });
+        }
         let needed = segments(&layout).iter().fold(0u64, |sum, &(_, bytes)| sum.saturating_add(bytes as u64));
         let free = free_shm_bytes();
         if needed > free {

@@ -66,7 +66,7 @@ pub(crate) fn index_layout(info: &VolumeInfo, sizes: StoreSizes) -> IndexLayout 
     let channels = Channel::ALL.map(|channel| {
         let slots = sizes.of(channel) as u64;
         let (entry_count, slot_count) = match channel {
-            Channel::Voxels => (bricks, bricks + slots),
+            Channel::Voxels => (bricks, bricks.saturating_add(slots)),
             Channel::State => (1, slots),
             _ => (if slots > 0 { bricks } else { 0 }, slots),
         };
@@ -153,6 +153,9 @@ pub(crate) fn checked(l: IndexLayout, sum: u64) -> Result<(IndexLayout, VolumeIn
         return fail(fault);
     }
     let info = VolumeInfo { grid, rescale: Rescale { slope: l.rescale[0], intercept: l.rescale[1] } };
+    if !info.rescale.slope.is_finite() || !info.rescale.intercept.is_finite() {
+        return fail(format!("a rescale of {:?}", l.rescale));
+    }
     let bricks = BrickLayout::new(info.grid.size);
     let count = bricks.count() as u64;
     for (channel, c) in Channel::ALL.into_iter().zip(&l.channels) {

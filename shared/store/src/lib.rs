@@ -75,6 +75,8 @@ pub enum StoreError {
          (`mount -o remount,size=8G /dev/shm`, or `docker run --shm-size=8g`) or take a smaller volume"
     )]
     Room { needed_mib: u64, free_mib: u64 },
+    #[error("the plan asks for {asked} slots of one channel; a store numbers at most {most}")]
+    Slots { asked: u64, most: u32 },
     #[error("the read-only region `{name}` cannot be used: {reason}")]
     Region { name: String, reason: String },
     #[error(

@@ -79,7 +79,7 @@ fn found(said: Said, text: &str) -> ! {
     exit(FOUND)
 }
 
-/// `writer DOMAIN SEED` or `reader DOMAIN SEED FIRST_PIN`.
+/// `writer DOMAIN SEED`, or `reader` or `hunter DOMAIN SEED FIRST_PIN`.
 pub fn main(arguments: &[String]) -> ! {
     // standard output is line-buffered: records hold no line ends on purpose, so `say` flushes
     let domain = Domain::named(&arguments[1]).expect("the parent's domain");
@@ -87,6 +87,7 @@ pub fn main(arguments: &[String]) -> ! {
     match arguments[0].as_str() {
         "writer" => write(&domain, seed),
         "reader" => read(&domain, seed, arguments[3].parse().expect("a pin")),
+        "hunter" => hunt(&domain, arguments[3].parse().expect("a pin")),
         other => panic!("no child {other:?}"),
     }
 }
@@ -169,6 +170,36 @@ fn read(domain: &Domain, seed: u64, first_pin: usize) -> ! {
         while held.len() == crate::PINS_EACH || (!held.is_empty() && random.below(2) == 0) {
             look(&held[0]);
             held.pop_front();
+        }
+    }
+}
+
+/// A reader that waits for each epoch and looks at once at what has just been written.
+fn hunt(domain: &Domain, first_pin: usize) -> ! {
+    let reader = Reader::open_with_pins(domain, first_pin..first_pin + crate::PINS_EACH).expect("the store opens");
+    let rest = reader.rest();
+    let (mut seen, mut looks) = (reader.epoch(), 0u64);
+    loop {
+        let mut turns = 0u32;
+        while reader.epoch() == seen {
+            std::hint::spin_loop();
+            turns += 1;
+            if turns.is_multiple_of(1 << 14) {
+                std::thread::yield_now();
+            }
+        }
+        let snapshot = reader.snapshot();
+        seen = snapshot.epoch();
+        if let Err((wrong, text)) = tissue::check_newest(&snapshot, &rest) {
+            found(Said::Wrong(wrong), &text);
+        }
+        looks += 1;
+        // a full look now and then, so that it counts among the readers
+        if looks.is_multiple_of(64) {
+            if let Err((wrong, text)) = tissue::check(&snapshot, &rest) {
+                found(Said::Wrong(wrong), &text);
+            }
+            say(Said::Right(seen, seen));
         }
     }
 }

@@ -49,6 +49,13 @@ impl World {
         Process::start(&["reader", self.domain.name(), &seed.to_string(), &pin], environment)
     }
 
+    /// The reader of a siege at a place: the last one hunts.
+    pub fn besieger_at(&self, place: usize, seed: u64) -> Process {
+        let pin = (place * crate::PINS_EACH).to_string();
+        let kind = if place + 1 == crate::READERS { "hunter" } else { "reader" };
+        Process::start(&[kind, self.domain.name(), &seed.to_string(), &pin], &[])
+    }
+
     /// Releases a reader's pins, once it is known to be dead.
     pub fn release(&self, place: usize) {
         for pin in &self.control.pins[place * crate::PINS_EACH..][..crate::PINS_EACH] {
@@ -141,6 +148,22 @@ impl Process {
             }
             assert!(Instant::now() < deadline, "a child does not say what is waited for");
             std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Waits until a writer has recovered and committed (or put off) so many transactions, or has ended by itself.
+    pub fn commits(&mut self, count: u64) {
+        let deadline = Instant::now() + PATIENCE;
+        let is_done = |said: &[Said]| {
+            let commits = said.iter().filter(|s| matches!(s, Said::Published(..) | Said::PutOff(..))).count() as u64;
+            commits >= count && said.iter().any(|s| matches!(s, Said::Opened(..)))
+        };
+        while !is_done(&self.said.lock().expect("no panic")) && self.ended().is_none() {
+            // a protocol that is broken may leave a writer without room for ever
+            if Instant::now() > deadline {
+                return;
+            }
+            std::thread::sleep(Duration::from_micros(200));
         }
     }
 
