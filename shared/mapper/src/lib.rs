@@ -3,7 +3,7 @@
 //! The voxel at x takes the rest value at X with X + u(X) = x, sampled ([`Sampling`]) and rounded. Only voxels whose
 //! pre-image may have changed are solved ([`rows`]); everything else keeps its bits.
 //!
-//! Beside voids (below the tissue's threshold) and cuts ([`CutLinks`]) the map is taken apart into pieces of tissue ([`pieces`]): a cell
+//! Beside voids (below the tissue's threshold), cuts and removed elements the map is taken apart into pieces of tissue ([`pieces`]): a cell
 //! that a cut crosses is never interpolated across, a surface moves with the tissue it belongs to. There, and where limits of a third
 //! and more fold the map, the cells around are searched; folded cells are counted. A voxel in the image of no tissue is void
 //! (`void_hu`): what opened is a gap of air; a void that nothing entered or left keeps its own values. A pre-image outside the grid is
@@ -25,7 +25,6 @@ pub mod tetrahedra;
 mod window;
 mod write;
 
-pub use pieces::CutLinks;
 pub use sample::Sampling;
 
 use maille_chainmail::{ChainMail, ChangedRegion};
@@ -156,26 +155,9 @@ impl Mapper {
         Self { seen, ..Self::default() }
     }
 
-    /// Rewrites the voxels whose pre-image the changed elements may have changed. Runs on rayon's current pool.
+    /// Rewrites the voxels whose pre-image the changed elements may have changed; with the region of a cut, what it took out. Runs on
+    /// rayon's current pool.
     pub fn remap<S, K>(&mut self, rest: &S, mail: &ChainMail, region: &ChangedRegion, sink: &mut K, options: &MapOptions) -> MapReport
-    where
-        S: BrickSource + ?Sized,
-        K: BrickSink + ?Sized,
-    {
-        self.remap_cut(rest, mail, None, region, sink, options)
-    }
-
-    /// The same in tissue with cut links. Elements beside a link that was cut since the last mapping need not be in `region`: a cut shows when
-    /// something moves.
-    pub fn remap_cut<S, K>(
-        &mut self,
-        rest: &S,
-        mail: &ChainMail,
-        cuts: Option<&dyn CutLinks>,
-        region: &ChangedRegion,
-        sink: &mut K,
-        options: &MapOptions,
-    ) -> MapReport
     where
         S: BrickSource + ?Sized,
         K: BrickSink + ?Sized,
@@ -183,7 +165,7 @@ impl Mapper {
         if let Mapping::Tetrahedra(split) = options.mapping {
             return tetrahedra::remap(rest, mail, region, sink, split);
         }
-        let gaps = cuts.is_some() || mail.tissue().threshold_hu.is_some();
+        let gaps = mail.tissue().threshold_hu.is_some() || !mail.cut_bricks().is_empty();
         let Self { wanted, parts, values, workspaces, seen } = self;
         let lend = || Lent::take(workspaces);
 
@@ -219,7 +201,7 @@ impl Mapper {
         }
 
         // 2. their values, brick by brick
-        let solver = Solver::new(rest, mail, cuts, options);
+        let solver = Solver::new(rest, mail, gaps, options);
         if values.len() < wanted.ids.len() {
             values.resize(wanted.ids.len(), [0; _]);
         }

@@ -5,20 +5,19 @@
 //! of its own nearest ones: with one corner it is a translation, and on a face that holds only its own corners it is what the
 //! neighbouring cell says, so that tissue has no seam. A piece owns the part of a cell that lies nearest to its
 //! corners: half of a link reaches from each side of a cut, and all of it into a void, so that a surface keeps its partial
-//! volume when it moves. What no piece's image holds is a gap.
+//! volume when it moves. A removed element's part belongs to nobody. What no piece's image holds is a gap.
 
 use crate::{rows::Box3, window::Window};
-use maille_volume::{BrickId, BrickSource, brick::EDGE};
+use maille_chainmail::{CUT, ChainMail, DisplacementBrick};
+use maille_volume::{BrickSource, brick::EDGE};
 
-/// Which links are cut.
-pub trait CutLinks: Sync {
-    /// For each element of a brick, i fastest: bits 0, 1, 2 are set where its link to the next element along i, j, k is cut
-    /// (`maille_chainmail::CUT`); other bits mean nothing here. `None`: no link of the brick is cut.
-    fn of_brick(&self, id: BrickId) -> Option<&[u8; EDGE * EDGE * EDGE]>;
-}
-
-/// Tissue, beside bits 0 to 2 for cut links.
+/// Tissue, beside the bits of cut links (`maille_chainmail::CUT`).
 const TISSUE: u8 = 8;
+/// Taken out: a void that no piece reaches into, since what is seen there at rest is gone.
+const REMOVED: u8 = 16;
+
+/// All three links of an element.
+const ALL_CUT: u8 = CUT[0] | CUT[1] | CUT[2];
 
 /// Corners of a cell that hang together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,8 +40,9 @@ pub struct Pieces {
 
 impl Pieces {
     /// Reads the elements that a window holds.
-    pub fn gather<S: BrickSource + ?Sized>(&mut self, rest: &S, threshold_hu: Option<f64>, cuts: Option<&dyn CutLinks>, window: &Window) {
+    pub fn gather<S: BrickSource + ?Sized>(&mut self, rest: &S, mail: &ChainMail, window: &Window) {
         let (layout, rescale, low) = (*rest.layout(), rest.info().rescale, window.low());
+        let threshold = mail.tissue().threshold_hu;
         self.size = window.size();
         let [nx, ny, nz] = self.size;
         self.flags.clear();
@@ -52,10 +52,17 @@ impl Pieces {
                 let (y, z) = ((low[1] + j).min(layout.size[1] - 1), (low[2] + k).min(layout.size[2] - 1));
                 for i in 0..nx {
                     let x = (low[0] + i).min(layout.size[0] - 1);
-                    let tissue = threshold_hu.is_none_or(|t| rescale.value(f64::from(rest.voxel(x, y, z))) >= t);
-                    let n = (z % EDGE * EDGE + y % EDGE) * EDGE + x % EDGE;
-                    let cut = cuts.and_then(|c| c.of_brick(layout.brick_of(x, y, z))).map_or(0, |flags| flags[n] & 7);
-                    self.flags.push(cut | if tissue { TISSUE } else { 0 });
+                    let n = DisplacementBrick::offset(x % EDGE, y % EDGE, z % EDGE);
+                    let cut = mail.cut_brick(layout.brick_of(x, y, z)).map_or(0, |cuts| cuts[n] & ALL_CUT);
+                    let tissue = threshold.is_none_or(|t| rescale.value(f64::from(rest.voxel(x, y, z))) >= t);
+                    let kind = if cut == ALL_CUT && mail.is_removed([x, y, z]) {
+                        REMOVED
+                    } else if tissue {
+                        TISSUE
+                    } else {
+                        0
+                    };
+                    self.flags.push(cut | kind);
                 }
             }
         }
@@ -65,6 +72,16 @@ impl Pieces {
     pub fn all_tissue(&mut self, window: &Window) {
         self.size = window.size();
         self.flags.clear();
+    }
+
+    /// Whether an element is tissue.
+    pub fn is_tissue(&self, at: [usize; 3]) -> bool {
+        self.flags.is_empty() || self.at(at) & TISSUE != 0
+    }
+
+    /// Whether an element was taken out.
+    pub fn is_removed(&self, at: [usize; 3]) -> bool {
+        !self.flags.is_empty() && self.at(at) & REMOVED != 0
     }
 
     fn at(&self, [i, j, k]: [usize; 3]) -> u8 {
@@ -138,7 +155,7 @@ fn split(corners: &[u8; 8], out: &mut [Piece; 8]) -> usize {
         count += 1;
     }
     // a void corner goes with the nearest piece, the first of several
-    for n in (0..8).filter(|&n| !tissue(n)) {
+    for n in (0..8).filter(|&n| corners[n] & (TISSUE | REMOVED) == 0) {
         if let Some(nearest) = (0..count).min_by_key(|&p| steps(out[p].own, n)) {
             out[nearest].territory |= 1 << n;
         }
@@ -210,6 +227,10 @@ mod tests {
         assert_eq!(split(&surface, &mut out), 1);
         assert_eq!((out[0].own, out[0].territory), (0x0f, 0xff));
         assert_eq!(out[0].holds([0.2, 0.2, 0.9]), Some(false));
+        // the same with the upper half taken out: nothing reaches there
+        let opened = std::array::from_fn(|n| if n < 4 { TISSUE } else { REMOVED });
+        assert_eq!(split(&opened, &mut out), 1);
+        assert_eq!((out[0].holds([0.2, 0.2, 0.9]), out[0].holds([0.2, 0.2, 0.4])), (None, Some(true)));
     }
 
     #[test]

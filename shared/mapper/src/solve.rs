@@ -6,7 +6,7 @@
 
 use crate::{
     MapOptions, MapReport, Mapping,
-    pieces::{CutLinks, Pieces},
+    pieces::Pieces,
     reach::{preimage_box, preimage_box_beside_gaps},
     rows::{Box3, ROWS, Spans, bounds},
     sample::{RestSampler, Sampling},
@@ -50,7 +50,8 @@ impl Workspace {
 pub struct Solver<'a, S: BrickSource + ?Sized> {
     rest: &'a S,
     mail: &'a ChainMail,
-    cuts: Option<&'a dyn CutLinks>,
+    /// whether voids or cuts take the map apart
+    gaps: bool,
     inverter: Inverter,
     options: MapOptions,
     /// beside voids and cuts: bricks that hold displacements
@@ -60,7 +61,7 @@ pub struct Solver<'a, S: BrickSource + ?Sized> {
 }
 
 impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
-    pub fn new(rest: &'a S, mail: &'a ChainMail, cuts: Option<&'a dyn CutLinks>, options: &MapOptions) -> Self {
+    pub fn new(rest: &'a S, mail: &'a ChainMail, gaps: bool, options: &MapOptions) -> Self {
         let void = rest.info().rescale.stored(options.void_hu).round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16;
         let mut inverter = Inverter::for_offset(mail.tissue().offset, options.tolerance).on_spacing(mail.spacing());
         match options.mapping {
@@ -68,9 +69,8 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             Mapping::Newton => inverter.scheme = Scheme::Newton,
             _ => {}
         }
-        let gaps = cuts.is_some() || mail.tissue().threshold_hu.is_some();
         let loaded = if gaps { mail.loaded_bricks() } else { Vec::new() };
-        Self { rest, mail, cuts, inverter, options: *options, loaded, void }
+        Self { rest, mail, gaps, inverter, options: *options, loaded, void }
     }
 
     /// Solves the wanted voxels of a brick.
@@ -80,8 +80,7 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         let displacement = self.mail.displacement_brick(id).filter(|_| self.mail.displacement_range(id) != [[0.0; 2]; 3]);
         // 1. rest values everywhere; what is left are the rows whose elements moved
         let (rest, values) = (self.rest.brick(id), values.as_chunks_mut::<EDGE>().0);
-        let threshold = self.mail.tissue().threshold_hu;
-        let all_linked = threshold.is_none() && self.cuts.is_none();
+        let all_linked = !self.gaps;
         let may_fold = !all_linked || self.mail.tissue().offset >= 1.0 / 3.0;
         for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
             let from = Brick::offset(0, (row % EDGE) as isize, (row / EDGE) as isize);
@@ -90,19 +89,19 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         }
         let open = &mut *work.open;
         for (row, span) in spans.iter().enumerate() {
-            // a void may be entered by others
-            open[row] = if threshold.is_none() { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) } else { *span };
+            // a void may be entered by others, and tissue at rest be taken out
+            open[row] = if all_linked { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) } else { *span };
         }
         let Some((low, high)) = bounds(open) else { return report };
         let voxels = Box3 { low: std::array::from_fn(|c| first[c] + low[c]), high: std::array::from_fn(|c| first[c] + high[c]) };
         let range = if all_linked { preimage_box(self.mail, voxels) } else { preimage_box_beside_gaps(self.mail, voxels, &self.loaded) };
         work.window.gather(self.mail, range);
-        if work.window.at_rest() {
+        if work.window.at_rest() && self.mail.cut_brick(id).is_none() {
             return report;
         }
         let (window, found, pieces, left) = (&work.window, &mut *work.found, &mut work.pieces, &mut work.left);
         if may_fold {
-            pieces.gather(self.rest, threshold, self.cuts, window);
+            pieces.gather(self.rest, self.mail, window);
         } else {
             pieces.all_tissue(window);
         }
@@ -140,7 +139,7 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             }
             // the few that did not converge, and what lies beside voids and cuts, are left
             for i in range.clone() {
-                if still(i) && self.is_tissue(out[i]) {
+                if still(i) && pieces.is_tissue([at(0, i), at(1, j), at(2, k)]) {
                     continue;
                 }
                 let (target, near) = (xyz(target[i]), position[i]);
@@ -172,8 +171,8 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
                 }
                 // deep in a void nothing changed; what tissue left, or its surface, is void now
                 None => {
-                    let deep =
-                        !self.is_tissue(*out) && !pieces.is_near_tissue(std::array::from_fn(|c| first[c] + [i, j, k][c] - origin[c]));
+                    let at = std::array::from_fn(|c| first[c] + [i, j, k][c] - origin[c]);
+                    let deep = !pieces.is_near_tissue(at) && !pieces.is_removed(at);
                     deep.then_some(*out)
                 }
             };
@@ -206,12 +205,6 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             }
         }
         count
-    }
-
-    /// Whether a stored value is one of tissue: a void may be entered by others.
-    #[inline]
-    fn is_tissue(&self, stored: i16) -> bool {
-        self.mail.tissue().threshold_hu.is_none_or(|t| self.rest.info().rescale.value(f64::from(stored)) >= t)
     }
 }
 

@@ -1,8 +1,8 @@
 //! Voids, cuts and folds: what opens is air, what closes is tissue, nothing else changes; and where bricks end nothing shows.
 
-use maille_chainmail::{Admission, ChainMail, DisplacementBrick, Motion, Pin, Tissue};
-use maille_mapper::{CutLinks, MapOptions, MapReport, Mapper, remap};
-use maille_volume::{BrickId, BrickLayout, BrickSource, BrickedVolume, Grid, Rescale, Volume, brick::EDGE};
+use maille_chainmail::{Admission, CUT, ChainMail, DisplacementBrick, Motion, Pin, Tissue};
+use maille_mapper::{MapOptions, MapReport, Mapper, remap};
+use maille_volume::{BrickId, BrickSource, BrickedVolume, Grid, Rescale, Volume, brick::EDGE};
 
 const AIR: i16 = -1000;
 
@@ -32,22 +32,12 @@ fn displace(mail: &mut ChainMail, u: impl Fn([usize; 3]) -> [f64; 3]) {
     }
 }
 
-/// Links cut where a function says so.
-struct Cuts(Vec<[u8; EDGE * EDGE * EDGE]>);
-
-impl Cuts {
-    fn new(layout: &BrickLayout, bits: impl Fn([usize; 3]) -> u8) -> Self {
-        let brick = |id| {
-            let first = layout.first_voxel(id);
-            std::array::from_fn(|n| bits([first[0] + n % EDGE, first[1] + n / EDGE % EDGE, first[2] + n / (EDGE * EDGE)]))
-        };
-        Self((0..layout.count() as BrickId).map(brick).collect())
-    }
-}
-
-impl CutLinks for Cuts {
-    fn of_brick(&self, id: BrickId) -> Option<&[u8; EDGE * EDGE * EDGE]> {
-        self.0.get(id as usize)
+/// Cuts the links that a function gives the bits of.
+fn cut(mail: &mut ChainMail, bits: impl Fn([usize; 3]) -> u8) {
+    for id in 0..mail.layout().count() as BrickId {
+        let first = mail.layout().first_voxel(id);
+        let cuts = std::array::from_fn(|n| bits([first[0] + n % EDGE, first[1] + n / EDGE % EDGE, first[2] + n / (EDGE * EDGE)]));
+        mail.restore_cut_brick(id, &cuts);
     }
 }
 
@@ -66,10 +56,10 @@ fn a_cut_drawn_apart_shows_air_between_its_sides_and_tissue_everywhere_else() {
     let rest = volume(size, |[i, j, k]| (20 * i + 3 * j) as f64 - 2.0 * k as f64);
     let mut mail = ChainMail::new(rest.info(), tissue(0.3, None));
     displace(&mut mail, |[i, _, _]| [drawn_apart(i as f64), 0.0, 0.0]);
-    let cuts = Cuts::new(mail.layout(), |[i, _, _]| u8::from(i == 19));
+    cut(&mut mail, |[i, _, _]| if i == 19 { CUT[0] } else { 0 });
     let mut deformed = rest.clone();
     let region = mail.displaced_region();
-    let report = Mapper::new().remap_cut(&rest, &mail, Some(&cuts), &region, &mut deformed, &MapOptions::default());
+    let report = remap(&rest, &mail, &region, &mut deformed, &MapOptions::default());
     let mut air = 0;
     for [i, j, k] in voxels(size) {
         let got = f64::from(deformed.voxel(i, j, k));
@@ -99,17 +89,40 @@ fn a_cut_drawn_apart_shows_air_between_its_sides_and_tissue_everywhere_else() {
 }
 
 #[test]
+fn what_is_taken_out_is_air_and_its_neighbours_stay() {
+    let size = [40, 36, 34];
+    let rest = volume(size, |[i, j, k]| (20 * i + 3 * j) as f64 - 2.0 * k as f64);
+    let mut mail = ChainMail::new(rest.info(), tissue(0.2, None));
+    let (mut mapper, mut deformed) = (Mapper::new(), rest.clone());
+    let (low, high) = ([13, 14, 12], [19, 17, 18]);
+    let region = mail.remove_box(low, high);
+    mapper.remap(&rest, &mail, &region, &mut deformed, &MapOptions::default());
+    let inside = |v: [usize; 3]| (0..3).all(|c| (low[c]..=high[c]).contains(&v[c]));
+    for v in voxels(size) {
+        let expected = if inside(v) { AIR } else { rest.voxel(v[0], v[1], v[2]) };
+        assert_eq!(deformed.voxel(v[0], v[1], v[2]), expected, "{v:?}");
+    }
+    // and moved along with what is around it, by whole voxels in the middle: the hole moves too
+    displace(&mut mail, |v| [0.0, 0.0, (4.0 - 0.25 * (v[0] as f64 - 16.0).abs().max((v[1] as f64 - 15.0).abs()).max(3.0) + 0.75).min(4.0)]);
+    mapper.remap(&rest, &mail, &mail.displaced_region(), &mut deformed, &MapOptions::default());
+    for k in 10..26 {
+        let expected = if (16..=22).contains(&k) { AIR } else { rest.voxel(16, 15, k - 4) };
+        assert_eq!(deformed.voxel(16, 15, k), expected, "{k}");
+    }
+}
+
+#[test]
 fn a_cut_that_does_not_open_shows_nothing() {
     let size = [40, 40, 24];
     let rest = volume(size, |[i, j, k]| 10.0 * (i as f64) + 4.0 * (j as f64) - 3.0 * (k as f64));
     let mut mail = ChainMail::new(rest.info(), tissue(0.1, None));
     // both sides move as one, whatever way: nothing opens
     displace(&mut mail, |[_, j, k]| [1.3 * (1.0 - (j as f64 - 20.0).abs() / 18.0).max(0.0), 0.0, 0.4 * (k as f64 / 24.0)]);
-    let cuts = Cuts::new(mail.layout(), |[i, _, _]| u8::from(i == 19));
     let (mut with, mut without) = (rest.clone(), rest.clone());
     let region = mail.displaced_region();
-    let report = Mapper::new().remap_cut(&rest, &mail, Some(&cuts), &region, &mut with, &MapOptions::default());
     remap(&rest, &mail, &region, &mut without, &MapOptions::default());
+    cut(&mut mail, |[i, _, _]| if i == 19 { CUT[0] } else { 0 });
+    let report = remap(&rest, &mail, &region, &mut with, &MapOptions::default());
     for [i, j, k] in voxels(size) {
         let (a, b) = (with.voxel(i, j, k), without.voxel(i, j, k));
         // void only where the pre-image lies outside the grid, and there in both
