@@ -23,8 +23,10 @@ pub mod device;
 pub mod friction;
 pub mod limits;
 pub mod material;
+mod node;
 pub mod passivity;
 pub mod proxy;
+pub mod shape;
 pub mod shaper;
 pub mod surface;
 mod tick;
@@ -36,6 +38,7 @@ pub use device::{ConsoleDevice, Device, DevicePose, Easing, Grip, Path, PathDevi
 pub use material::{Material, TissueTable};
 pub use passivity::{Passivity, Port};
 pub use proxy::{Contact, Proxy, Touch};
+pub use shape::{ContactNode, ToolShape};
 pub use shaper::{ForceShaper, Limits};
 pub use surface::{AnalyticSurface, Isosurface, Surface};
 pub use tick::{Faults, HapticConfig, HapticCore, TickInputs, TickOutputs};

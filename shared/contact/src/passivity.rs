@@ -154,6 +154,16 @@ impl Passivity {
         }
     }
 
+    /// λ of the last tick: what else is given to the device shall be lowered alike.
+    pub(crate) fn share(&self) -> f64 {
+        self.share
+    }
+
+    /// Work [mJ] that the torque given has done on the hand since the last tick.
+    pub(crate) fn turned(&mut self, work_mj: f64) {
+        self.energy_mj -= work_mj;
+    }
+
     /// The force given `ago` ticks before the last.
     fn force_ago(&self, ago: usize) -> V3 {
         let length = self.given.len();

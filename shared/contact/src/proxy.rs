@@ -122,6 +122,11 @@ impl Proxy {
 
     /// Moves the tip to `at` [mm]. A position that is not finite leaves everything as it was.
     pub fn update<S: Surface + ?Sized>(&mut self, tissue: &S, at: [f64; 3]) -> Touch {
+        self.update_within(tissue, at, true)
+    }
+
+    /// The same; without `search` a tip in the air does not look around for tissue (or for a nearer part of it) in this tick.
+    pub fn update_within<S: Surface + ?Sized>(&mut self, tissue: &S, at: [f64; 3], search: bool) -> Touch {
         let Some(x) = finite(at) else { return self.touch(V3::zeros(), false) };
         let inside = is_inside(tissue, x);
         let mut moved = false;
@@ -137,7 +142,7 @@ impl Proxy {
             State::Free => {
                 if inside {
                     self.find_from_inside(tissue, x);
-                } else {
+                } else if search {
                     self.find_in_air(tissue, x);
                 }
             }

@@ -1,22 +1,10 @@
 //! One tick of touch: pose in, force out.
 //!
-//! **Indentation and give-way.** With d the tip's penetration into the tissue *as committed now*, and m the way that tissue under the
-//! tip has given way since the contact began, the indentation is δ = max(0, d + m) and the normal force f(δ) of `material`.
-//! A commit that moves the surface away by Δ lowers d by Δ and raises m by Δ: δ, force and stored energy stay as they were, whatever
-//! the rate of commits. So tissue resists by how far it was pushed from where the tip first met it. Withdrawn, the tip leaves a dent: with
-//! a gap g between tip and tissue, m fades by exp(−Δg / 1.5 mm) while g grows, so the force ends near the dent that is seen
-//! (a dent that springs back in further commits instead lowers m and raises d, and is felt as elastic). Sliding along the
-//! surface by t lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. At δ = 0 the contact ends and m is forgotten. What is no pushing is carried in a second term β that goes to 0 within 0.1 s, δ = max(0, d + m + β): a
-//! surface that comes towards the tip (relaxing or breathing tissue) beyond where it was met, a new threshold, a foot that
-//! jumps to a nearer wall. So all of these are felt, and none as a step.
+//! A tool is one ball or several (`shape`); each finds its own contact (`node`), and their forces add up, with a torque about the handle.
+//! In the air no more than [`MAX_SEARCHES`] nodes look around for tissue in a tick, in turn; a node whose centre is inside tissue, or that has a
+//! contact, is never left out. So work is bounded whatever the shape.
 //!
-//! Energy: along the normal the tissue is a spring in δ; a commit leaves δ unchanged; fading m > 0 only lowers the stored
-//! energy. So neither commits nor sliding can feed the hand; β can, as tissue that moves by itself does, by a bounded amount.
-//!
-//! **Blend.** What remains of a discontinuity (normal and tangential direction at a commit, a foot that jumps to another wall, a new
-//! threshold) is bridged: the difference to the last force is added and taken away linearly within `blend_s`.
-//!
-//! **Order**: pose checks · proxy · give-way · tissue law, damping, friction · blend · limits and fades · passivity · tool
+//! **Order**: pose checks · nodes (proxy, give-way, tissue law, damping, friction, blend) · limits and fades · passivity · tool
 //! move. Degraded modes: pose invalid, stale or not finite → the last pose is kept and the force fades; snapshot too old → fade;
 //! jump → the proxy starts anew, buried where it lands in tissue; time backwards → nominal step. Each is counted in
 //! [`Faults`]. Replay: the same inputs give the same outputs, bit by bit.
@@ -26,33 +14,22 @@ use crate::{
     coupling::Coupling,
     device::DevicePose,
     finite,
-    friction::Friction,
-    limits::{MAX_JUMP_MM, MAX_STEP_S},
-    material::{Material, TissueTable},
+    limits::{MAX_JUMP_MM, MAX_NODES, MAX_SEARCHES, MAX_STEP_S},
+    material::TissueTable,
+    node::{Circumstances, Node},
     passivity::{Passivity, Port},
-    proxy::{Proxy, Touch},
+    proxy::Contact,
+    shape::ToolShape,
     shaper::{ForceShaper, Limits},
     surface::Surface,
     toolmove::{MoveGate, ToolMove},
 };
+use nalgebra::{Quaternion, UnitQuaternion};
 
-/// Time constant in which a move of the surface that the tool did not cause comes to be felt [s].
-const BIAS_S: f64 = 0.1;
-/// Growth of the gap over which a give-way is forgotten [mm].
-const GAP_MM: f64 = 1.5;
-/// Time constant of the material under the tip [s]: a tip that slides from mucosa to bone feels no step.
-const MATERIAL_S: f64 = 0.01;
 /// Time constant of the velocity estimate [s].
 const VELOCITY_S: f64 = 0.005;
-/// Depth over which damping sets in [mm], so that touching is no step.
-const DAMPING_DEPTH_MM: f64 = 0.5;
-/// The material is read this far below the surface [mm]: at the surface itself every tissue has the threshold's value.
-const MATERIAL_DEPTH_MM: f64 = 1.5;
 /// Energy beyond the elastic one that the passivity controller counts as stored [mJ].
 const RESERVE_MJ: f64 = 2.0;
-/// Largest give-way that is believed [mm].
-const MAX_GIVE_WAY_MM: f64 = 60.0;
-
 /// What stays the same from tick to tick.
 #[derive(Clone, Copy, Debug)]
 pub struct HapticConfig {
@@ -84,6 +61,14 @@ pub struct HapticConfig {
     pub pose_quantum_mm: f64,
     /// least mass at the tip, device and hand [kg]; the passivity controller needs it
     pub device_mass_kg: f64,
+    /// the balls of the tool; as made by [`HapticConfig::new`], one of `radius_mm` at the tip
+    pub shape: ToolShape,
+    /// the point that the device holds, in the tool's frame [mm]: torque is about it
+    pub handle_mm: [f64; 3],
+    /// limits of the device's torque [N·mm, N·mm/s]; 0: it has none
+    pub max_torque_n_mm: f64,
+    /// see `max_torque_n_mm`
+    pub max_torque_slew_n_mm_per_s: f64,
 }
 
 impl HapticConfig {
@@ -104,6 +89,10 @@ impl HapticConfig {
             pose_delay_ticks: 0,
             pose_quantum_mm: 0.0,
             device_mass_kg: Port::default().mass_kg,
+            shape: ToolShape::sphere(radius_mm),
+            handle_mm: [0.0; 3],
+            max_torque_n_mm: 0.0,
+            max_torque_slew_n_mm_per_s: 0.0,
         }
     }
 }
@@ -150,9 +139,11 @@ pub struct Faults {
 pub struct TickOutputs {
     /// force on the hand [N]
     pub force_n: [f64; 3],
+    /// torque on the hand about the handle [N·mm]; zero where the device has none
+    pub torque_n_mm: [f64; 3],
     /// centre of the tip [mm]: the last valid position
     pub tip_mm: [f64; 3],
-    /// centre of the tip held at the surface [mm]; the tip's own where there is no contact
+    /// centre of the deepest node held at the surface [mm]; the tip's own where there is no contact
     pub proxy_mm: [f64; 3],
     /// foot point on the surface [mm]; the tip's centre where there is no contact
     pub contact_mm: [f64; 3],
@@ -162,8 +153,10 @@ pub struct TickOutputs {
     pub penetration_mm: f64,
     /// how far the tissue is pushed from where the tip met it [mm], at least 0: what the force comes from
     pub indentation_mm: f64,
-    /// the tip feels tissue
+    /// the tool feels tissue
     pub in_contact: bool,
+    /// nodes that feel tissue, one bit each; `shape` has their places
+    pub nodes: u32,
     /// inside tissue without having come from outside: nothing is felt
     pub buried: bool,
     /// the force is being faded to zero
@@ -174,44 +167,34 @@ pub struct TickOutputs {
     pub faults: Faults,
 }
 
-/// A difference being taken away.
-#[derive(Clone, Copy, Debug)]
-struct Bridge {
-    /// at its beginning [N]
-    difference: V3,
-    /// how much is left, 1 → 0
-    left: f64,
-    /// from 1 to 0 [s]
-    duration_s: f64,
-}
-
 /// State of touch between ticks.
 pub struct HapticCore {
     config: HapticConfig,
-    proxy: Proxy,
-    friction: Friction,
+    nodes: [Node; MAX_NODES],
+    /// largest slope of a law of share 1 [N/mm], so that all nodes together stay within the coupling
+    slope: f64,
     passivity: Passivity,
     shaper: ForceShaper,
+    torque_shaper: ForceShaper,
     gate: MoveGate,
     faults: Faults,
     last_ns: Option<u64>,
     position: Option<V3>,
     velocity: V3,
+    world_from_tool: Option<UnitQuaternion<f64>>,
+    /// told by `set_orientation`, for the next tick
+    orientation: Option<UnitQuaternion<f64>>,
+    /// [rad/s]
+    spin: V3,
     epoch: Option<u64>,
     threshold: f64,
-    /// m [mm]
-    give_way: f64,
-    /// β [mm]
-    bias: f64,
-    /// largest gap between tip and tissue since they last touched [mm]
-    gap: f64,
-    last_point: Option<V3>,
-    material: Option<Material>,
     /// force before limits at the last tick [N]
     last_wanted: V3,
-    bridge: Bridge,
-    /// energy in the contact's springs [mJ]
+    /// torque before limits at the last tick [N·mm]
+    last_torque: V3,
+    /// energy in the contacts' springs [mJ]
     elastic_mj: f64,
+    ticks: usize,
 }
 
 impl HapticCore {
@@ -220,33 +203,52 @@ impl HapticCore {
         let mut config = config;
         config.blend_s = if config.blend_s.is_finite() { config.blend_s.clamp(0.01, 1.0) } else { 0.02 };
         config.period_s = if config.period_s.is_finite() { config.period_s.clamp(1e-5, MAX_STEP_S) } else { 1e-3 };
+        if config.shape.nodes().len() == 1 && config.shape.nodes()[0].offset_mm == [0.0; 3] {
+            // a radius set after `HapticConfig::new`
+            config.shape = ToolShape::sphere(config.radius_mm);
+        }
         let port = Port {
             delay_ticks: config.pose_delay_ticks,
             quantum_mm: config.pose_quantum_mm,
             mass_kg: config.device_mass_kg,
             ..Port::default()
         };
+        let mut nodes = [Node::new(&config.shape.nodes()[0]); MAX_NODES];
+        for (node, of) in nodes.iter_mut().zip(config.shape.nodes()) {
+            *node = Node::new(of);
+        }
+        let torque = Limits { max_force_n: config.max_torque_n_mm, max_slew_n_per_s: config.max_torque_slew_n_mm_per_s, ..config.limits };
         Self {
-            proxy: Proxy::new(config.radius_mm),
-            friction: Friction::default(),
+            nodes,
+            slope: config.coupling.stiffness_n_per_mm() / config.shape.total_share(),
             passivity: Passivity::on_port(RESERVE_MJ, config.passivity_damping_n_s_per_mm, port),
             shaper: ForceShaper::new(config.limits),
+            torque_shaper: ForceShaper::new(torque),
             gate: MoveGate::default(),
             faults: Faults::default(),
             last_ns: None,
             position: None,
             velocity: V3::zeros(),
+            world_from_tool: None,
+            orientation: None,
+            spin: V3::zeros(),
             epoch: None,
             threshold: f64::NAN,
-            give_way: 0.0,
-            bias: 0.0,
-            gap: 0.0,
-            last_point: None,
-            material: None,
             last_wanted: V3::zeros(),
-            bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
+            last_torque: V3::zeros(),
             elastic_mj: 0.0,
+            ticks: 0,
             config,
+        }
+    }
+
+    /// Orientation of the tool as a quaternion (x, y, z, w) that takes the tool's frame to the patient's, for the next tick. Without it the
+    /// tool points along the pose's direction and is turned about that no more than it must be. Not finite or zero: ignored.
+    pub fn set_orientation(&mut self, xyzw: [f64; 4]) {
+        let length = xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
+        if length.is_finite() && length > 1e-9 {
+            let q = Quaternion::new(xyzw[3], xyzw[0], xyzw[1], xyzw[2]);
+            self.orientation = Some(UnitQuaternion::from_quaternion(q));
         }
     }
 
@@ -265,7 +267,8 @@ impl HapticCore {
     /// away. The force rises from zero all the same.
     pub fn resume(&mut self, tip_mm: [f64; 3], proxy_mm: [f64; 3]) {
         self.position = finite(tip_mm);
-        self.proxy.resume(proxy_mm);
+        // only the node at the tip was told of
+        self.nodes[0].proxy.resume(proxy_mm);
     }
 
     /// One tick. Allocates nothing; bounded work.
@@ -278,8 +281,10 @@ impl HapticCore {
             self.faults.stale_tissue += 1;
             fading = true;
         }
+        let jumped = self.turn(&inputs.pose, dt, jumped);
         let mut out = TickOutputs {
             force_n: [0.0; 3],
+            torque_n_mm: [0.0; 3],
             tip_mm: x.into(),
             proxy_mm: x.into(),
             contact_mm: x.into(),
@@ -287,24 +292,26 @@ impl HapticCore {
             penetration_mm: 0.0,
             indentation_mm: 0.0,
             in_contact: false,
+            nodes: 0,
             buried: false,
             fading: false,
             tool_move: None,
             faults: self.faults,
         };
         // without tissue the last force is held and faded; without any valid pose there was never one
-        let mut wanted = self.last_wanted;
         if let (Some(tissue), Some(_)) = (inputs.tissue, self.position) {
-            wanted = self.touch(tissue, inputs, x, dt, jumped, &mut out);
+            self.touch(tissue, inputs, x, dt, jumped, &mut out);
         }
-        self.last_wanted = wanted;
         // a late tick gets no larger a step: what the hand would feel is one tick's change
-        out.force_n = self.shaper.shape(wanted.into(), dt.min(self.config.period_s), fading);
+        let step = dt.min(self.config.period_s);
+        out.force_n = self.shaper.shape(self.last_wanted.into(), step, fading);
+        out.torque_n_mm = self.torque_shaper.shape(self.last_torque.into(), step, fading);
         if self.config.passivity && self.position.is_some() {
             // after the limits: a fall that the slew limit would stretch may be more than is stored
             let force = self.passivity.control(x, V3::from(out.force_n), self.elastic_mj, dt);
             self.shaper.cut_to(force);
-            out.force_n = self.shaper.last_n();
+            self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
+            (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
         }
         self.passivity.given(V3::from(out.force_n));
         out.fading = fading;
@@ -356,137 +363,108 @@ impl HapticCore {
         (x, jumped)
     }
 
-    /// Contact and force before limits [N].
-    fn touch<S: Surface + ?Sized>(
-        &mut self,
-        tissue: &S,
-        inputs: &TickInputs<'_, S>,
-        x: V3,
-        dt: f64,
-        jumped: bool,
-        out: &mut TickOutputs,
-    ) -> V3 {
-        let radius = self.proxy.radius_mm();
+    /// Orientation of the tool in this tick; whether it, or the device before, jumped.
+    fn turn(&mut self, pose: &DevicePose, dt: f64, jumped: bool) -> bool {
+        let last = self.world_from_tool;
+        let next = match (self.orientation.take(), finite(pose.direction).and_then(|d| d.try_normalize(1e-9)), last) {
+            (Some(told), _, _) => Some(told),
+            (None, None, _) => last,
+            (None, Some(direction), last) => {
+                let last = last.unwrap_or_else(UnitQuaternion::identity);
+                let z = last * V3::z();
+                // a turn by half has no axis of its own: about x
+                let turn = UnitQuaternion::rotation_between(&z, &direction)
+                    .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&(last * V3::x_axis()), std::f64::consts::PI));
+                let mut next = turn * last;
+                // one Newton step of the norm, so that rounding does not add up (not the iterative kind, which may never end)
+                next.renormalize_fast();
+                Some(next)
+            }
+        };
+        self.ticks += 1;
+        let turned = match (last, next) {
+            (Some(last), Some(next)) => (next * last.inverse()).scaled_axis(),
+            _ => V3::zeros(),
+        };
+        self.world_from_tool = next;
+        // a single ball at the tip has nothing that a turn could move
+        let swept = turned.norm() * self.config.shape.reach_mm();
+        let leapt = self.config.shape.nodes().len() > 1 && swept > MAX_JUMP_MM;
+        if jumped || leapt {
+            self.faults.jumps += u64::from(!jumped);
+            self.spin = V3::zeros();
+            return true;
+        }
+        if dt > 0.0 {
+            self.spin += (turned / dt - self.spin) * (dt / (dt + VELOCITY_S));
+        }
+        if self.config.passivity {
+            self.passivity.turned(V3::from(self.torque_shaper.last_n()).dot(&turned));
+        }
+        false
+    }
+
+    /// Contact of all nodes: force and torque before limits.
+    fn touch<S: Surface + ?Sized>(&mut self, tissue: &S, inputs: &TickInputs<'_, S>, x: V3, dt: f64, jumped: bool, out: &mut TickOutputs) {
         let committed = self.epoch.replace(inputs.epoch).is_some_and(|last| last != inputs.epoch);
         let threshold = tissue.threshold();
         let other_surface = self.threshold != threshold && !self.threshold.is_nan();
         self.threshold = threshold;
-        let was_felt = self.last_point.is_some();
-        if jumped {
-            self.proxy.reset();
-            self.end_contact();
-        }
-        let before = self.proxy.height_over_foot_mm(x.into()).map(|h| radius - h);
-        let touch = self.proxy.update(tissue, x.into());
-        let lost = was_felt.then_some(self.config.limits.fade_s.max(self.config.blend_s));
-        let Touch::Surface { contact, moved } = touch else {
-            out.buried = touch == Touch::Buried;
-            // the surface went away inside tissue, or the tip is free
-            self.faults.lost_contacts += u64::from(out.buried && was_felt);
-            self.end_contact();
-            return self.bridged(V3::zeros(), dt, lost);
+        let now = Circumstances {
+            config: &self.config,
+            dt,
+            jumped,
+            committed,
+            other_surface,
+            threshold,
+            stiffness_n_per_mm: self.slope,
+            damping_n_s_per_mm: self.config.coupling.damping_n_s_per_mm() / self.config.shape.total_share(),
         };
-        let (point, normal) = (V3::from(contact.point_mm), V3::from(contact.normal));
-        let d = contact.penetration_mm;
-        let blend = (was_felt && (committed || other_surface || moved)).then_some(self.config.blend_s);
-        if self.last_point.is_some() {
-            let change = before.filter(|_| blend.is_some()).map(|before| before - d);
-            self.carry(change, committed && !other_surface, d, point, dt);
-        } else if moved {
-            // already pressed where it is found first: felt gradually
-            self.bias = -d.max(0.0);
+        let rotation = self.world_from_tool.unwrap_or_else(UnitQuaternion::identity);
+        let handle = x + rotation * V3::from(self.config.handle_mm);
+        let shape = &self.config.shape;
+        let count = shape.nodes().len();
+        let (mut force, mut torque, mut buried) = (V3::zeros(), V3::zeros(), 0);
+        let mut deepest: Option<(usize, V3, Contact)> = None;
+        self.elastic_mj = 0.0;
+        for (n, (node, of)) in self.nodes.iter_mut().zip(shape.nodes()).enumerate() {
+            let arm = rotation * V3::from(of.offset_mm);
+            let velocity = self.velocity + self.spin.cross(&arm);
+            let search = (n + count - self.ticks * MAX_SEARCHES % count) % count < MAX_SEARCHES;
+            let felt = node.touch(tissue, x + arm, velocity, search, &now);
+            force += felt.force;
+            torque += (felt.at - handle).cross(&felt.force);
+            buried += usize::from(felt.buried);
+            self.faults.lost_contacts += u64::from(felt.lost);
+            self.elastic_mj += felt.elastic_mj;
+            if self.config.passivity {
+                self.passivity.grant(felt.granted_mj);
+            }
+            if let Some((contact, indentation)) = felt.contact {
+                out.nodes |= 1 << n;
+                out.in_contact = true;
+                out.indentation_mm = out.indentation_mm.max(indentation);
+                if deepest.is_none_or(|(_, _, other)| contact.penetration_mm > other.penetration_mm) {
+                    deepest = Some((n, x + arm, contact));
+                }
+            }
         }
-        let delta = (d + self.give_way + self.bias).max(0.0);
-        if delta <= 0.0 && d <= 0.0 {
-            self.end_contact();
-            return self.bridged(V3::zeros(), dt, if jumped { lost } else { blend });
-        }
-        self.last_point = Some(point);
-        let force = self.contact_force(tissue, point, normal, delta, dt);
+        (self.last_wanted, self.last_torque) = (force, torque);
+        out.buried = buried == count;
+        let Some((n, centre, contact)) = deepest else { return };
         out.proxy_mm = contact.proxy_mm;
         out.contact_mm = contact.point_mm;
         out.normal = contact.normal;
-        out.penetration_mm = d.max(0.0);
-        out.indentation_mm = delta;
-        out.in_contact = true;
-        out.tool_move = self.gate.due(inputs.now_ns, d).map(|sequence| ToolMove {
-            tip_mm: x.into(),
-            outside_mm: self.proxy.outside_mm().unwrap_or(contact.proxy_mm),
+        out.penetration_mm = contact.penetration_mm.max(0.0);
+        let proxy = &self.nodes[n].proxy;
+        out.tool_move = self.gate.due(inputs.now_ns, contact.penetration_mm).map(|sequence| ToolMove {
+            tip_mm: centre.into(),
+            outside_mm: proxy.outside_mm().unwrap_or(contact.proxy_mm),
             contact_mm: contact.point_mm,
             normal: contact.normal,
-            depth_mm: d,
-            radius_mm: radius,
+            depth_mm: contact.penetration_mm,
+            radius_mm: proxy.radius_mm(),
             sequence,
         });
-        self.bridged(force, dt, blend)
-    }
-
-    /// Carries m and β over a tick. A surface that moved changed d by −`change`: that goes to m when a commit did it (β takes what
-    /// would make m negative) and to β when not. Sliding, a growing gap and time let them fade.
-    fn carry(&mut self, change: Option<f64>, committed: bool, d: f64, point: V3, dt: f64) {
-        let travelled = self.last_point.map_or(V3::zeros(), |last| point - last);
-        match change {
-            Some(change) if committed => {
-                self.give_way += change;
-                self.bias += self.give_way.min(0.0);
-                self.give_way = self.give_way.max(0.0);
-                self.friction.carry(travelled);
-            }
-            Some(change) => {
-                self.bias += change;
-                self.friction.carry(travelled);
-            }
-            None => self.give_way *= (-travelled.norm() / (2.0 * self.proxy.radius_mm())).exp(),
-        }
-        let gap = (-d).max(0.0);
-        if change.is_some() || gap == 0.0 {
-            self.gap = gap;
-        } else if gap > self.gap {
-            self.give_way *= ((self.gap - gap) / GAP_MM).exp();
-            self.gap = gap;
-        }
-        self.bias = (self.bias * (-dt / BIAS_S).exp()).clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
-        self.give_way = self.give_way.min(MAX_GIVE_WAY_MM);
-    }
-
-    /// Normal force, damping and friction [N].
-    fn contact_force<S: Surface + ?Sized>(&mut self, tissue: &S, point: V3, normal: V3, delta: f64, dt: f64) -> V3 {
-        let value = tissue.value((point - normal * MATERIAL_DEPTH_MM).into()).unwrap_or(self.threshold);
-        let here = self.config.tissue.at(value);
-        let material = self.material.map_or(here, |last| last.between(&here, dt / (dt + MATERIAL_S)));
-        self.material = Some(material);
-        let coupling = &self.config.coupling;
-        let damping = material.damping_n_s_per_mm.min(coupling.damping_n_s_per_mm()) * (delta / DAMPING_DEPTH_MM).min(1.0);
-        let elastic = material.normal_force(delta, coupling.stiffness_n_per_mm());
-        self.elastic_mj = material.normal_energy(delta, coupling.stiffness_n_per_mm());
-        // pressed in: resists; withdrawn: damping may only lower the push, never pull
-        let normal_n = (elastic - damping * self.velocity.dot(&normal)).max(0.0);
-        let mut force = normal * normal_n;
-        if self.config.friction {
-            // tangentially as stiff as the tissue's first contact, within the coupling
-            let k = material.stiffness_n_per_mm.min(coupling.stiffness_n_per_mm());
-            force += self.friction.force(point, normal, normal_n, k, material.friction_static, material.friction_kinetic);
-        }
-        force
-    }
-
-    /// Bridges a discontinuity: continues from the last force and lets the difference go within `over_s`.
-    fn bridged(&mut self, force: V3, dt: f64, over_s: Option<f64>) -> V3 {
-        if let Some(duration_s) = over_s {
-            self.bridge = Bridge { difference: self.last_wanted - force, left: 1.0, duration_s };
-            return self.last_wanted;
-        }
-        self.bridge.left = (self.bridge.left - dt / self.bridge.duration_s).max(0.0);
-        force + self.bridge.difference * self.bridge.left
-    }
-
-    fn end_contact(&mut self) {
-        self.give_way = 0.0;
-        self.bias = 0.0;
-        self.gap = 0.0;
-        self.elastic_mj = 0.0;
-        self.last_point = None;
-        self.material = None;
-        self.friction.release();
     }
 }

@@ -1,0 +1,257 @@
+//! One contact node: a ball of the tool, its proxy, and what the tissue under it has done since they met.
+//!
+//! **Indentation and give-way.** With d the ball's penetration into the tissue *as committed now*, and m the way that tissue under it
+//! has given way since the contact began, the indentation is δ = max(0, d + m) and the normal force f(δ) of `material`.
+//! A commit that moves the surface away by Δ lowers d by Δ and raises m by Δ: δ, force and stored energy stay as they were, whatever
+//! the rate of commits. So tissue resists by how far it was pushed from where the ball first met it. Withdrawn, the ball leaves a dent: with
+//! a gap g between ball and tissue, m fades by exp(−Δg / 1.5 mm) while g grows, so the force ends near the dent that is seen
+//! (a dent that springs back in further commits instead lowers m and raises d, and is felt as elastic). Sliding along the
+//! surface by t lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. At δ = 0 the contact ends and m is forgotten. What is no
+//! pushing is carried in a second term β that goes to 0 within 0.1 s, δ = max(0, d + m + β): a
+//! surface that comes towards the ball (relaxing or breathing tissue) beyond where it was met, a new threshold, a foot that
+//! jumps to a nearer wall. So all of these are felt, and none as a step.
+//!
+//! Energy: along the normal the tissue is a spring in δ; a commit leaves δ unchanged; fading m > 0 only lowers the stored
+//! energy. So neither commits nor sliding can feed the hand; β can, as tissue that moves by itself does, by a bounded amount, which is told
+//! ([`Felt::granted_mj`]).
+//!
+//! **Blend.** What remains of a discontinuity (normal and tangential direction at a commit, a foot that jumps to another wall, a new
+//! threshold) is bridged: the difference to the last force is added and taken away linearly within `blend_s`.
+//! Units: mm, N, s. Cost: `proxy`'s. Allocation: none.
+
+use crate::{
+    V3,
+    friction::Friction,
+    material::Material,
+    proxy::{Contact, Proxy, Touch},
+    shape::ContactNode,
+    surface::Surface,
+    tick::HapticConfig,
+};
+
+/// Time constant in which a move of the surface that the tool did not cause comes to be felt [s].
+const BIAS_S: f64 = 0.1;
+/// Growth of the gap over which a give-way is forgotten [mm].
+const GAP_MM: f64 = 1.5;
+/// Time constant of the material under the tip [s]: a tip that slides from mucosa to bone feels no step.
+const MATERIAL_S: f64 = 0.01;
+/// Depth over which damping sets in [mm], so that touching is no step.
+const DAMPING_DEPTH_MM: f64 = 0.5;
+/// The material is read this far below the surface [mm]: at the surface itself every tissue has the threshold's value.
+const MATERIAL_DEPTH_MM: f64 = 1.5;
+/// Largest give-way that is believed [mm].
+const MAX_GIVE_WAY_MM: f64 = 60.0;
+
+/// What all nodes of a tick have in common.
+#[derive(Clone, Copy)]
+pub(crate) struct Circumstances<'a> {
+    pub config: &'a HapticConfig,
+    /// time since the last tick [s]
+    pub dt: f64,
+    /// the tool jumped
+    pub jumped: bool,
+    /// a commit lies between the last tick and this one
+    pub committed: bool,
+    /// the threshold is another one
+    pub other_surface: bool,
+    /// value at the surface
+    pub threshold: f64,
+    /// largest slope of a law of share 1 [N/mm], and largest damping [N·s/mm]
+    pub stiffness_n_per_mm: f64,
+    pub damping_n_s_per_mm: f64,
+}
+
+/// What a node felt.
+#[derive(Clone, Copy)]
+pub(crate) struct Felt {
+    /// on the hand [N]
+    pub force: V3,
+    /// where it acts [mm]
+    pub at: V3,
+    /// the contact and its indentation [mm], where there is one
+    pub contact: Option<(Contact, f64)>,
+    pub buried: bool,
+    /// the surface went away inside tissue
+    pub lost: bool,
+    /// energy in its springs [mJ]
+    pub elastic_mj: f64,
+    /// work that tissue did by moving by itself [mJ]
+    pub granted_mj: f64,
+}
+
+/// A difference being taken away.
+#[derive(Clone, Copy, Debug)]
+struct Bridge {
+    /// at its beginning [N]
+    difference: V3,
+    /// how much is left, 1 → 0
+    left: f64,
+    /// from 1 to 0 [s]
+    duration_s: f64,
+}
+
+/// State of one node between ticks.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Node {
+    pub proxy: Proxy,
+    share: f64,
+    friction: Friction,
+    /// m [mm]
+    give_way: f64,
+    /// β [mm]
+    bias: f64,
+    /// largest gap between ball and tissue since they last touched [mm]
+    gap: f64,
+    last_point: Option<V3>,
+    material: Option<Material>,
+    /// at the last tick [N]
+    last_force: V3,
+    bridge: Bridge,
+}
+
+impl Node {
+    pub fn new(node: &ContactNode) -> Self {
+        Self {
+            proxy: Proxy::new(node.radius_mm),
+            share: node.share,
+            friction: Friction::default(),
+            give_way: 0.0,
+            bias: 0.0,
+            gap: 0.0,
+            last_point: None,
+            material: None,
+            last_force: V3::zeros(),
+            bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
+        }
+    }
+
+    /// Contact and force before limits, with the ball's centre at `x` moving with `velocity`; `search` allows a look around for tissue.
+    pub fn touch<S: Surface + ?Sized>(&mut self, tissue: &S, x: V3, velocity: V3, search: bool, now: &Circumstances<'_>) -> Felt {
+        let radius = self.proxy.radius_mm();
+        let was_felt = self.last_point.is_some();
+        if now.jumped {
+            self.proxy.reset();
+            self.end_contact();
+        }
+        let before = self.proxy.height_over_foot_mm(x.into()).map(|h| radius - h);
+        let touch = self.proxy.update_within(tissue, x.into(), search);
+        let mut felt = Felt { force: V3::zeros(), at: x, contact: None, buried: false, lost: false, elastic_mj: 0.0, granted_mj: 0.0 };
+        let lost = was_felt.then_some(now.config.limits.fade_s.max(now.config.blend_s));
+        let Touch::Surface { contact, moved } = touch else {
+            felt.buried = touch == Touch::Buried;
+            // the surface went away inside tissue, or the ball is free
+            felt.lost = felt.buried && was_felt;
+            self.end_contact();
+            felt.force = self.bridged(V3::zeros(), now.dt, lost);
+            return felt;
+        };
+        let (point, normal) = (V3::from(contact.point_mm), V3::from(contact.normal));
+        let d = contact.penetration_mm;
+        let blend = (was_felt && (now.committed || now.other_surface || moved)).then_some(now.config.blend_s);
+        let bias = self.bias;
+        if self.last_point.is_some() {
+            let change = before.filter(|_| blend.is_some()).map(|before| before - d);
+            self.carry(change, now.committed && !now.other_surface, d, point, now.dt);
+        } else if moved {
+            // already pressed where it is found first: felt gradually
+            self.bias = -d.max(0.0);
+        }
+        let delta = (d + self.give_way + self.bias).max(0.0);
+        if delta <= 0.0 && d <= 0.0 {
+            self.end_contact();
+            felt.force = self.bridged(V3::zeros(), now.dt, if now.jumped { lost } else { blend });
+            return felt;
+        }
+        self.last_point = Some(point);
+        felt.at = point;
+        felt.contact = Some((contact, delta));
+        let force = self.law(tissue, point, normal, delta, velocity, now, &mut felt);
+        if blend.is_none() {
+            felt.granted_mj = (self.bias - bias).max(0.0) * force.dot(&normal).max(0.0);
+        }
+        felt.force = self.bridged(force, now.dt, blend);
+        felt
+    }
+
+    /// Carries m and β over a tick. A surface that moved changed d by −`change`: that goes to m when a commit did it (β takes what
+    /// would make m negative) and to β when not. Sliding, a growing gap and time let them fade.
+    fn carry(&mut self, change: Option<f64>, committed: bool, d: f64, point: V3, dt: f64) {
+        let travelled = self.last_point.map_or(V3::zeros(), |last| point - last);
+        match change {
+            Some(change) if committed => {
+                self.give_way += change;
+                self.bias += self.give_way.min(0.0);
+                self.give_way = self.give_way.max(0.0);
+                self.friction.carry(travelled);
+            }
+            Some(change) => {
+                self.bias += change;
+                self.friction.carry(travelled);
+            }
+            None => self.give_way *= (-travelled.norm() / (2.0 * self.proxy.radius_mm())).exp(),
+        }
+        let gap = (-d).max(0.0);
+        if change.is_some() || gap == 0.0 {
+            self.gap = gap;
+        } else if gap > self.gap {
+            self.give_way *= ((self.gap - gap) / GAP_MM).exp();
+            self.gap = gap;
+        }
+        self.bias = (self.bias * (-dt / BIAS_S).exp()).clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
+        self.give_way = self.give_way.min(MAX_GIVE_WAY_MM);
+    }
+
+    /// Normal force, damping and friction [N]; tells the energy in the springs.
+    #[allow(clippy::too_many_arguments)] // a law of that many things
+    fn law<S: Surface + ?Sized>(
+        &mut self,
+        tissue: &S,
+        point: V3,
+        normal: V3,
+        delta: f64,
+        velocity: V3,
+        now: &Circumstances<'_>,
+        felt: &mut Felt,
+    ) -> V3 {
+        let value = tissue.value((point - normal * MATERIAL_DEPTH_MM).into()).unwrap_or(now.threshold);
+        let here = now.config.tissue.at(value);
+        let material = self.material.map_or(here, |last| last.between(&here, now.dt / (now.dt + MATERIAL_S)));
+        self.material = Some(material);
+        let damping = material.damping_n_s_per_mm.min(now.damping_n_s_per_mm) * (delta / DAMPING_DEPTH_MM).min(1.0);
+        let elastic = material.normal_force(delta, now.stiffness_n_per_mm);
+        felt.elastic_mj = self.share * material.normal_energy(delta, now.stiffness_n_per_mm);
+        // pressed in: resists; withdrawn: damping may only lower the push, never pull
+        let normal_n = (elastic - damping * velocity.dot(&normal)).max(0.0);
+        let mut force = normal * normal_n;
+        if now.config.friction {
+            // tangentially as stiff as the tissue's first contact, within the coupling
+            let k = material.stiffness_n_per_mm.min(now.stiffness_n_per_mm);
+            let rubbing = self.friction.force(point, normal, normal_n, k, material.friction_static, material.friction_kinetic);
+            if k > 0.0 {
+                felt.elastic_mj += self.share * 0.5 * rubbing.norm_squared() / k;
+            }
+            force += rubbing;
+        }
+        force * self.share
+    }
+
+    /// Bridges a discontinuity: continues from the last force and lets the difference go within `over_s`.
+    fn bridged(&mut self, force: V3, dt: f64, over_s: Option<f64>) -> V3 {
+        if let Some(duration_s) = over_s {
+            self.bridge = Bridge { difference: self.last_force - force, left: 1.0, duration_s };
+            return self.last_force;
+        }
+        self.bridge.left = (self.bridge.left - dt / self.bridge.duration_s).max(0.0);
+        self.last_force = force + self.bridge.difference * self.bridge.left;
+        self.last_force
+    }
+
+    fn end_contact(&mut self) {
+        self.give_way = 0.0;
+        self.bias = 0.0;
+        self.gap = 0.0;
+        self.last_point = None;
+        self.material = None;
+        self.friction.release();
+    }
+}
