@@ -16,13 +16,13 @@ mod restore;
 mod state;
 mod step;
 
-use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
+use maille_contract::control::Counter;
 use maille_contract::messages::TOOL_IN_CONTACT;
-use maille_contract::{Commit, ControlBlock, Role, ToolMove, ToolState, ViewState};
+use maille_contract::{Commit, ControlBlock, Role, ToolMove, ViewState};
 use maille_scene::Scene;
 use maille_store::{Reader, Writer};
 use maille_transport::{Domain, Life, Node, monotonic_ns};
-use std::{sync::atomic::Ordering::Relaxed, time::Duration};
+use std::time::Duration;
 use thiserror::Error;
 
 /// Why the deformation process could not start.
@@ -115,6 +115,5 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
 
 /// Whether the tool touches tissue: then nothing relaxes. A haptic process that is gone touches nothing.
 fn touched(control: &ControlBlock) -> bool {
-    let silent = monotonic_ns().saturating_sub(control.service(Role::Haptic).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
-    !silent && control.tool.load::<ToolState>().is_some_and(|(tool, _)| tool.flags & TOOL_IN_CONTACT != 0)
+    control.held_tool(monotonic_ns()).is_some_and(|tool| tool.flags & TOOL_IN_CONTACT != 0)
 }

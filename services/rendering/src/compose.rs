@@ -28,8 +28,8 @@ impl Composer {
         self.pictures.iter().map(|p| p.rgb.len()).sum()
     }
 
-    /// Draws all views from one source.
-    pub fn draw(&mut self, source: &impl BrickSource, view: &View, tool: Option<&ToolState>) -> Result<(), RenderError> {
+    /// Draws all views from one source. The tool is where views look; it is drawn while somebody holds it.
+    pub fn draw(&mut self, source: &impl BrickSource, view: &View, tool: Option<&ToolState>, held: bool) -> Result<(), RenderError> {
         let (camera, at_tip) = view.camera(tool);
         let settings = view.settings(at_tip);
         let skip = match &mut self.skip {
@@ -41,7 +41,7 @@ impl Composer {
         };
         let [whole, sections @ ..] = &mut self.pictures;
         render(source, skip, &camera, &settings, whole)?;
-        if let Some(tool) = tool.filter(|_| !at_tip) {
+        if let Some(tool) = tool.filter(|_| held && !at_tip) {
             overlay::draw_tool(whole, &camera, tool);
         }
         let [level, window] = view.window_hu();

@@ -61,7 +61,7 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
-    let mut shown: Option<(u64, u64, Option<[f64; 3]>)> = None;
+    let mut shown: Option<(u64, u64, Option<[f64; 3]>, bool)> = None;
     loop {
         let now = monotonic_ns();
         if !life.beat(now) {
@@ -76,13 +76,14 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
             life.cell().count(Counter::Refused, 1);
         }
         let tool = life.control().tool.load::<ToolState>().map(|(tool, _)| tool);
-        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())));
+        let held = life.control().held_tool(now).is_some();
+        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), held);
         if shown == Some(seen) && now - last_sent_ns < STILL_NS {
             continue;
         }
         shown = Some(seen);
         let snapshot = reader.snapshot();
-        let drawn = pool.install(|| composer.draw(&snapshot, &view, tool.as_ref()));
+        let drawn = pool.install(|| composer.draw(&snapshot, &view, tool.as_ref(), held));
         let render_ns = monotonic_ns() - now;
         let epoch = snapshot.epoch();
         drop(snapshot);

@@ -228,9 +228,40 @@ impl ControlBlock {
         self.clock.store(clock);
     }
 
+    /// The tool as somebody holds it; `None` when nobody does: the haptic process is dead, ends, or has been silent for
+    /// [`HEARTBEAT_LATE_NS`]. Then the tool counts as withdrawn, wherever it was last.
+    pub fn held_tool(&self, monotonic_ns: u64) -> Option<ToolState> {
+        let haptic = self.service(crate::Role::Haptic);
+        let beats = monotonic_ns.saturating_sub(haptic.heartbeat_ns.load(Relaxed)) <= HEARTBEAT_LATE_NS;
+        let held = beats && haptic.state() == ServiceState::Ready;
+        held.then(|| self.tool.load::<ToolState>()).flatten().map(|(tool, _)| tool)
+    }
+
     /// Whether a service should end: the run stops, or the supervisor no longer beats.
     pub fn should_end(&self, monotonic_ns: u64) -> bool {
         self.run_state() == RunState::Stopping
             || monotonic_ns.saturating_sub(self.supervisor_heartbeat_ns.load(Relaxed)) > 10 * SUPERVISOR_BEAT_NS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Role;
+
+    #[test]
+    fn a_tool_that_nobody_holds_is_withdrawn() {
+        let control = ControlBlock::zeroed();
+        let haptic = control.service(Role::Haptic);
+        assert!(control.held_tool(0).is_none(), "nobody has ever held it");
+        control.tool.store(&ToolState::zeroed());
+        haptic.heartbeat_ns.store(1_000, Relaxed);
+        haptic.set_state(ServiceState::Ready);
+        assert!(control.held_tool(1_000 + HEARTBEAT_LATE_NS).is_some());
+        assert!(control.held_tool(1_001 + HEARTBEAT_LATE_NS).is_none(), "it hangs");
+        for gone in [ServiceState::Absent, ServiceState::Starting, ServiceState::Ended] {
+            haptic.set_state(gone);
+            assert!(control.held_tool(1_000).is_none(), "{gone:?}");
+        }
     }
 }
