@@ -13,7 +13,11 @@ use maille_contract::Role;
 use maille_store::{CommitOutcome, Reader, StoreKeeper, StoreSizes, Transaction, Writer};
 use maille_transport::{ControlMap, Domain, monotonic_ns};
 use maille_volume::{Grid, Rescale, Volume};
-use std::{hint::black_box, time::Duration};
+use std::{
+    hint::black_box,
+    sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
+    time::Duration,
+};
 
 /// Bricks that one commit changes.
 const CHANGED: [u32; 3] = [1, 64, 512];
@@ -31,6 +35,43 @@ fn percentiles(mut times: Vec<u64>) -> String {
     times.sort_unstable();
     let at = |p: f64| times[((times.len() - 1) as f64 * p) as usize];
     format!("p50 {} p99 {} p99.9 {} max {} ns", at(0.5), at(0.99), at(0.999), at(1.0))
+}
+
+/// `snapshot()` while another thread commits one brick after the other. Some samples meet a cache line that the writer has just taken (the
+/// head after a commit, the pin after the writer looked at it): how many and how long they are is what p99 is made of.
+fn beside_a_restless_writer(writer: &mut Writer, reader: &Reader) {
+    let (stop, commits) = (AtomicBool::new(false), AtomicU64::new(0));
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            for round in 0u32.. {
+                let mut t = writer.begin();
+                t.brick_mut(round % 4096).voxels[0] = round as i16;
+                t.commit();
+                commits.store(u64::from(round), Relaxed);
+                if stop.load(Relaxed) {
+                    break;
+                }
+            }
+        });
+        for _ in 0..5 {
+            let from = (commits.load(Relaxed), monotonic_ns());
+            let times: Vec<u64> = (0..1_000_000)
+                .map(|_| {
+                    let began = monotonic_ns();
+                    drop(black_box(reader.snapshot()));
+                    monotonic_ns() - began
+                })
+                .collect();
+            let every_ns = (monotonic_ns() - from.1) / (commits.load(Relaxed) - from.0).max(1);
+            let above = |ns: u64| times.iter().filter(|&&t| t > ns).count() as f64 * 1e-4;
+            let above = [100, 200, 400, 1000].map(above);
+            println!(
+                "beside a restless writer (a commit every {every_ns} ns): above 100, 200, 400, 1000 ns: {above:.3?} %; {}",
+                percentiles(times)
+            );
+        }
+        stop.store(true, Relaxed);
+    });
 }
 
 fn store(c: &mut Criterion) {
@@ -84,6 +125,7 @@ fn store(c: &mut Criterion) {
     };
     println!("snapshot(), clock included: {}", percentiles((0..200_000).map(single).collect()));
     group.bench_function("snapshot", |b| b.iter(|| black_box(reader.snapshot().epoch())));
+    beside_a_restless_writer(&mut writer, &reader);
     drop(writer);
     group.bench_function("recover", |b| {
         b.iter_batched(|| (), |()| Writer::open(&domain).expect("the store opens"), BatchSize::PerIteration)

@@ -117,8 +117,8 @@ impl Writer {
         point(Point::Superseded);
     }
 
-    /// Frees what no pin shows any more.
-    pub(crate) fn reclaim(&mut self) {
+    /// Frees what no pin shows any more. [`Writer::begin`] and a commit that finds too few slots do so by themselves.
+    pub fn reclaim(&mut self) {
         let seen = if broken(Broken::ReclaimEarly) { Pinned::NONE } else { pinned(&self.control.pins, self.index.head()) };
         point(Point::PinsRead);
         let mut retired = std::mem::take(&mut self.retired);

@@ -20,6 +20,10 @@ pub(crate) const KINDS: usize = CHANNELS + 2;
 pub(crate) const LEAVES: usize = CHANNELS;
 pub(crate) const ROOTS: usize = CHANNELS + 1;
 
+/// So many superseded slots and pages are looked at together: whenever the writer looks at the pins it takes their cache lines from the
+/// readers, whose next snapshots wait for them to come back. Where free slots are few it looks at every transaction.
+const RECLAIM_BATCH: usize = 64;
+
 /// What a kind is called in sentences.
 pub(crate) fn kind_name(kind: usize) -> &'static str {
     match kind {
@@ -198,7 +202,10 @@ impl Writer {
 
     /// Starts a transaction.
     pub fn begin(&mut self) -> Transaction<'_> {
-        self.reclaim();
+        let short = |channel: usize| self.free[channel].len() < 2 * self.largest[channel];
+        if self.retired.len() >= RECLAIM_BATCH || (0..CHANNELS).any(short) {
+            self.reclaim();
+        }
         Transaction::new(self)
     }
 

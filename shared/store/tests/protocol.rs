@@ -204,7 +204,7 @@ fn a_new_writer_finds_the_last_commit_and_every_slot() {
     }
     assert_eq!(pinned.to_volume().voxels, truth);
     drop(pinned);
-    drop(writer.begin());
+    writer.reclaim();
     let shown: usize = { (0..96).filter(|&id| reader.snapshot().stamp(id) > 0).count() };
     assert_eq!(writer.spare_slots(), total - shown, "no slot may leak");
 }
@@ -224,7 +224,7 @@ fn a_dead_readers_pin_holds_its_epoch_until_it_is_released() {
     for pin in &world.control.pins[Role::Rendering.pins()] {
         pin.word.store(PIN_IDLE, Relaxed);
     }
-    drop(writer.begin());
+    writer.reclaim();
     assert!(writer.spare_slots() >= low);
     assert_eq!(writer.spare_slots(), 4);
 }
