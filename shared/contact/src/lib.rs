@@ -34,7 +34,9 @@ mod toolmove;
 mod velocity;
 
 pub use coupling::{Coupling, CouplingError};
-pub use device::{ConsoleDevice, Device, DevicePose, Easing, Grip, Path, PathDevice, PathError, SimulatedHand, WayPoint};
+pub use device::{
+    ConsoleDevice, Device, DevicePose, DeviceProfile, DeviceStatus, Easing, Grip, Path, PathDevice, PathError, SimulatedHand, WayPoint,
+};
 pub use material::{Material, TissueTable};
 pub use passivity::{Passivity, Port};
 pub use proxy::{Contact, Proxy, Touch};

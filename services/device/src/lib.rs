@@ -1,0 +1,101 @@
+//! Real haptic devices, bound at run time: nothing of a vendor's is needed to build.
+//!
+//! ```text
+//! haptic tick ◀── report cell ── thread of the device ◀──── WebSocket (inverse3), libHD (touch), libdhd (forcedimension)
+//!             ──▶ command cell ─▶                     ────▶
+//! ```
+//!
+//! Whatever a device needs that can block (a socket, a vendor's library, plugging in again) happens on a thread of its own
+//! ([`link`]); the tick only loads and stores latest values, so it allocates nothing and never waits. The thread is the last
+//! guard: a tick that falls silent for [`link::SILENT_NS`] gets zero force, and so does a device that is let go.
+//!
+//! Frames: each device has its own; a [`Mounting`] takes it to the patient's. Units at the border: mm, N, N·mm, s.
+//! [`probe()`] tells what is there and what is missing.
+//!
+//! Unsafe code lives in `foreign` alone (calls into shared objects that were opened at run time).
+
+pub mod error;
+mod forcedimension;
+#[allow(unsafe_code)] // calls into vendors' shared objects; each block has its reason
+mod foreign;
+mod inverse3;
+pub mod link;
+pub mod mounting;
+pub mod probe;
+pub mod profiles;
+mod touch;
+
+pub use error::DeviceError;
+pub use inverse3::Protocol;
+pub use link::RemoteDevice;
+pub use mounting::Mounting;
+pub use probe::{Finding, probe};
+
+use std::path::PathBuf;
+
+/// A kind of real device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Haply Inverse3, by the Haply Inverse Service's WebSocket
+    Inverse3,
+    /// 3D Systems Touch and Phantom, by libHD
+    Touch,
+    /// Force Dimension omega, delta, sigma, lambda and Novint Falcon, by libdhd
+    ForceDimension,
+}
+
+impl Kind {
+    /// All kinds.
+    pub const ALL: [Self; 3] = [Self::Inverse3, Self::Touch, Self::ForceDimension];
+
+    /// The kind of this name, as scenes and `--device` write it.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
+
+    /// Its name in scenes and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Inverse3 => "inverse3",
+            Self::Touch => "touch",
+            Self::ForceDimension => "forcedimension",
+        }
+    }
+}
+
+/// How to find and use a device; `Options::default()` is right for one device on this machine.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// inverse3: host and port of the service
+    pub address: String,
+    /// inverse3: form of its commands
+    pub protocol: Protocol,
+    /// touch, forcedimension: the vendor's shared object; `None`: where the system finds it
+    pub library: Option<PathBuf>,
+    /// touch: configuration name; inverse3: device id; `None`: the first
+    pub device: Option<String>,
+    /// from the device's frame to the patient's
+    pub mounting: Mounting,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { address: "127.0.0.1:10001".into(), protocol: Protocol::Auto, library: None, device: None, mounting: Mounting::default() }
+    }
+}
+
+/// Opens a device. A thread of its own looks for it until it is found, and again whenever it is unplugged; until then it
+/// reads as unplugged.
+///
+/// # Errors
+/// When the vendor's library is missing or lacks a function, or a thread cannot be started. A device that is not plugged in is no error.
+pub fn open(kind: Kind, options: &Options) -> Result<RemoteDevice, DeviceError> {
+    match kind {
+        Kind::Inverse3 => RemoteDevice::start(inverse3::Inverse3::new(options), profiles::INVERSE3, options.mounting),
+        Kind::Touch => RemoteDevice::start(touch::Touch::load(options)?, profiles::TOUCH, options.mounting),
+        Kind::ForceDimension => {
+            let device = forcedimension::ForceDimension::load(options)?;
+            RemoteDevice::start(device, profiles::OMEGA, options.mounting)
+        }
+    }
+}

@@ -1,0 +1,280 @@
+//! The thread of a device, and the device as the tick sees it.
+//!
+//! The thread opens the device, exchanges (a report against a command) as fast as the device does, and when that fails closes it,
+//! tells so, and looks again every [`RETRY`]. Reports and commands pass through latest-value cells: the tick's calls are loads and
+//! stores, never waits.
+//!
+//! Safe side: a command older than [`SILENT_NS`] counts as zero force (the tick hangs or died); forces that are not finite or beyond the
+//! profile are held; after a reconnection the force rises again over [`RISE_NS`]; on drop the device gets zero force before it is closed.
+
+use crate::{DeviceError, Mounting, mounting};
+use bytemuck::{Pod, Zeroable};
+use maille_contact::{Device, DevicePose, DeviceProfile, DeviceStatus};
+use maille_contract::cell::LatestCell;
+use maille_realtime::monotonic_ns;
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
+    },
+    thread::{self, JoinHandle},
+    time::Duration,
+};
+
+/// A tick that has not written for this long has gone [ns].
+pub const SILENT_NS: u64 = 20_000_000;
+/// Pause between two attempts to find a device.
+pub const RETRY: Duration = Duration::from_millis(100);
+/// Rise of the force after a device came (back) [ns].
+pub const RISE_NS: u64 = 500_000_000;
+
+/// What a device says, in its own frame.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct Report {
+    /// tip [mm]
+    pub position_mm: [f64; 3],
+    /// of the tip [mm/s]
+    pub velocity_mm_s: [f64; 3],
+    /// of the tool (x, y, z, w); zero where the device knows none
+    pub orientation: [f64; 4],
+    /// one bit each
+    pub buttons: u64,
+    /// 1: ready to give force
+    pub ready: u64,
+    /// 1: `velocity_mm_s` is the device's own
+    pub has_velocity: u64,
+    /// when it was taken [ns, CLOCK_MONOTONIC]
+    pub taken_ns: u64,
+}
+
+/// What a device shall do, in its own frame.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct Command {
+    /// [N]
+    pub force_n: [f64; 3],
+    /// [N·mm]
+    pub torque_n_mm: [f64; 3],
+    /// when it was given [ns, CLOCK_MONOTONIC]
+    pub given_ns: u64,
+    /// pads to a multiple of eight words
+    pub reserved: u64,
+}
+
+/// The side of a device that may block. All calls come from one thread.
+pub trait Driver: Send + 'static {
+    /// Finds the device and makes it ready.
+    ///
+    /// # Errors
+    /// When it is not there.
+    fn open(&mut self) -> Result<(), DeviceError>;
+    /// One exchange: gives the command, waits for the next report (a millisecond, as long as the device takes).
+    ///
+    /// # Errors
+    /// When the device has gone.
+    fn exchange(&mut self, command: &Command) -> Result<Report, DeviceError>;
+    /// Lets go; also after a failed exchange.
+    fn close(&mut self);
+}
+
+const REPORT_WORDS: usize = size_of::<Report>() / 8;
+const COMMAND_WORDS: usize = size_of::<Command>() / 8;
+
+struct Shared {
+    report: LatestCell<REPORT_WORDS>,
+    command: LatestCell<COMMAND_WORDS>,
+    stop: AtomicBool,
+    connected: AtomicBool,
+    /// times it was opened
+    opened: AtomicU64,
+    /// exchanges so far
+    exchanges: AtomicU64,
+}
+
+/// A real device as the tick sees it.
+pub struct RemoteDevice {
+    shared: Arc<Shared>,
+    profile: DeviceProfile,
+    mounting: Mounting,
+    last: Report,
+    seen: bool,
+    status: DeviceStatus,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl RemoteDevice {
+    /// Starts the thread of a device.
+    ///
+    /// # Errors
+    /// When the thread cannot be started.
+    pub fn start(driver: impl Driver, profile: DeviceProfile, mounting: Mounting) -> Result<Self, DeviceError> {
+        let shared = Arc::new(Shared {
+            report: LatestCell::zeroed(),
+            command: LatestCell::zeroed(),
+            stop: AtomicBool::new(false),
+            connected: AtomicBool::new(false),
+            opened: AtomicU64::new(0),
+            exchanges: AtomicU64::new(0),
+        });
+        let for_thread = Arc::clone(&shared);
+        let thread = thread::Builder::new().name("device".into()).spawn(move || serve(driver, &for_thread, &profile))?;
+        Ok(Self { shared, profile, mounting, last: Report::zeroed(), seen: false, status: DeviceStatus::Unplugged, thread: Some(thread) })
+    }
+
+    /// Times the device was opened: more than one after it was unplugged.
+    pub fn opened(&self) -> u64 {
+        self.shared.opened.load(Relaxed)
+    }
+
+    /// Exchanges with the device so far.
+    pub fn exchanges(&self) -> u64 {
+        self.shared.exchanges.load(Relaxed)
+    }
+}
+
+impl Device for RemoteDevice {
+    fn read(&mut self, _now_ns: u64) -> DevicePose {
+        if let Some((report, _)) = self.shared.report.load::<Report>() {
+            (self.last, self.seen) = (report, true);
+        }
+        self.status = match (self.seen && self.shared.connected.load(Relaxed), self.last.ready == 1) {
+            (false, _) => DeviceStatus::Unplugged,
+            (true, false) => DeviceStatus::NotReady,
+            (true, true) => DeviceStatus::Connected,
+        };
+        let direction = match self.orientation() {
+            // a tool points along its own z
+            Some(q) => mounting::matrix(q).map(|row| row[2]),
+            None => self.mounting.turn([0.0, 0.0, -1.0]),
+        };
+        DevicePose {
+            position_mm: self.mounting.place(self.last.position_mm),
+            direction,
+            velocity_mm_s: (self.last.has_velocity == 1)
+                .then(|| self.mounting.turn(self.last.velocity_mm_s).map(|v| v * self.mounting.scale)),
+            valid: self.status == DeviceStatus::Connected,
+        }
+    }
+
+    fn write(&mut self, force_n: [f64; 3]) {
+        self.write_wrench(force_n, [0.0; 3]);
+    }
+
+    fn write_wrench(&mut self, force_n: [f64; 3], torque_n_mm: [f64; 3]) {
+        let command = Command {
+            force_n: self.mounting.turn_back(force_n),
+            torque_n_mm: self.mounting.turn_back(torque_n_mm),
+            given_ns: monotonic_ns(),
+            reserved: 0,
+        };
+        self.shared.command.store(&command);
+    }
+
+    fn orientation(&self) -> Option<[f64; 4]> {
+        let told = self.last.orientation.iter().any(|&c| c != 0.0);
+        told.then(|| mounting::quaternion(mounting::product(self.mounting.rotation, mounting::matrix(self.last.orientation))))
+    }
+
+    fn buttons(&self) -> u32 {
+        self.last.buttons as u32
+    }
+
+    fn pose_age_s(&self) -> f64 {
+        if self.seen { monotonic_ns().saturating_sub(self.last.taken_ns) as f64 * 1e-9 } else { f64::INFINITY }
+    }
+
+    fn status(&self) -> DeviceStatus {
+        self.status
+    }
+
+    fn profile(&self) -> Option<DeviceProfile> {
+        Some(self.profile)
+    }
+}
+
+impl Drop for RemoteDevice {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Relaxed);
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+            // a thread that panicked has let go of its device already
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Closes the device however the thread ends.
+struct Opened<'a, D: Driver>(&'a mut D, &'a Shared);
+
+impl<D: Driver> Drop for Opened<'_, D> {
+    fn drop(&mut self) {
+        self.1.connected.store(false, Relaxed);
+        self.0.close();
+    }
+}
+
+fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile) {
+    while !shared.stop.load(Relaxed) {
+        if driver.open().is_err() {
+            driver.close();
+            thread::park_timeout(RETRY);
+            continue;
+        }
+        shared.opened.fetch_add(1, Relaxed);
+        let began = monotonic_ns();
+        let opened = Opened(&mut driver, shared);
+        while !shared.stop.load(Relaxed) {
+            let now = monotonic_ns();
+            let given = shared.command.load::<Command>().map(|(command, _)| command);
+            let command = safe(given, now, began, profile);
+            let Ok(mut report) = opened.0.exchange(&command) else { break };
+            report.taken_ns = monotonic_ns();
+            if report.position_mm.iter().all(|v| v.is_finite()) {
+                shared.report.store(&report);
+                shared.connected.store(true, Relaxed);
+            }
+            shared.exchanges.fetch_add(1, Relaxed);
+        }
+        if shared.stop.load(Relaxed) {
+            // a device that keeps its last force must not keep this one
+            let _ = opened.0.exchange(&Command::zeroed());
+        }
+        drop(opened);
+        if !shared.stop.load(Relaxed) {
+            thread::park_timeout(RETRY);
+        }
+    }
+}
+
+/// The command that the device gets: nothing when the tick is silent, within the profile, and rising after the device came.
+fn safe(given: Option<Command>, now_ns: u64, opened_ns: u64, profile: &DeviceProfile) -> Command {
+    let Some(given) = given.filter(|c| now_ns.saturating_sub(c.given_ns) <= SILENT_NS) else { return Command::zeroed() };
+    let rise = (now_ns.saturating_sub(opened_ns) as f64 / RISE_NS as f64).min(1.0);
+    let hold = |v: [f64; 3], max: f64| {
+        let length = v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        if !length.is_finite() || length == 0.0 { [0.0; 3] } else { v.map(|c| c * rise * (max / length).min(1.0)) }
+    };
+    Command { force_n: hold(given.force_n, profile.max_force_n), torque_n_mm: hold(given.torque_n_mm, profile.max_torque_n_mm), ..given }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::profiles::TOUCH;
+
+    #[test]
+    fn what_reaches_a_device_is_bounded_fresh_and_rises() {
+        let given = |force_n| Some(Command { force_n, torque_n_mm: [1.0; 3], given_ns: 1_000_000_000, reserved: 0 });
+        let at = |force, now, opened| safe(given(force), now, opened, &TOUCH);
+        assert_eq!(at([1.0, 0.0, 0.0], 1_000_000_000, 0).force_n, [1.0, 0.0, 0.0]);
+        assert_eq!(at([1.0, 0.0, 0.0], 1_000_000_000, 0).torque_n_mm, [0.0; 3], "a device without torque");
+        assert_eq!(at([1.0, 0.0, 0.0], 1_000_000_001 + SILENT_NS, 0), Command::zeroed());
+        assert_eq!(at([f64::NAN, 0.0, 0.0], 1_000_000_000, 0).force_n, [0.0; 3]);
+        assert_eq!(at([f64::INFINITY, 0.0, 0.0], 1_000_000_000, 0).force_n, [0.0; 3]);
+        let large = at([0.0, 30.0, 40.0], 1_000_000_000, 0).force_n;
+        assert!((large[1] - 0.6 * 3.3).abs() < 1e-12 && (large[2] - 0.8 * 3.3).abs() < 1e-12);
+        assert!((at([1.0, 0.0, 0.0], 1_000_000_000, 1_000_000_000 - RISE_NS / 4).force_n[0] - 0.25).abs() < 1e-12);
+        assert_eq!(safe(None, 0, 0, &TOUCH), Command::zeroed());
+    }
+}

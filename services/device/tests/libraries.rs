@@ -1,0 +1,177 @@
+//! touch and forcedimension against stand-ins for the vendors' libraries, built here as shared objects: 1 kHz, unplugged and plugged
+//! in again in mid-run, silent ticks, libraries that are missing or lack a function.
+
+use maille_contact::{Device, DeviceStatus};
+use maille_device::{DeviceError, Kind, Mounting, Options, RemoteDevice, open, probe::probe_kind};
+use maille_realtime::{CountingAllocator, Period, assert_steady, monotonic_ns};
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+    time::Duration,
+};
+
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
+
+/// Builds a stand-in; each test has its own, with its own state.
+fn built(mock: &str, test: &str) -> PathBuf {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/mocks").join(format!("{mock}.rs"));
+    let out = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("lib{mock}_{test}.so"));
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let status = Command::new(rustc)
+        .args(["--edition", "2024", "--crate-type", "cdylib", "--crate-name", mock, "-Awarnings", "-o"])
+        .arg(&out)
+        .arg(&source)
+        .status()
+        .expect("rustc runs");
+    assert!(status.success(), "{mock} is built");
+    out
+}
+
+/// The test's side of a stand-in.
+struct Mock(libloading::Library);
+
+impl Mock {
+    fn of(path: &Path) -> Self {
+        // SAFETY: a library built above, whose initialisers do nothing; the device opens the same one.
+        Self(unsafe { libloading::Library::new(path) }.expect("the stand-in opens"))
+    }
+    fn plug(&self, on: bool) {
+        // SAFETY: the type that the stand-in declares.
+        let plug = unsafe { self.0.get::<extern "C" fn(i32)>(b"mock_plug") }.unwrap();
+        plug(i32::from(on));
+    }
+    fn is_open(&self) -> bool {
+        // SAFETY: the type that the stand-in declares.
+        let open = unsafe { self.0.get::<extern "C" fn() -> i32>(b"mock_open") }.unwrap();
+        open() != 0
+    }
+    fn force(&self) -> [f64; 3] {
+        let mut to = [0.0; 3];
+        // SAFETY: the type that the stand-in declares.
+        let force = unsafe { self.0.get::<extern "C" fn(*mut f64)>(b"mock_force") }.unwrap();
+        force(to.as_mut_ptr());
+        to
+    }
+}
+
+/// Ticks at 1 kHz until `done`, or two thousand times `seconds`; never blocking, never allocating.
+fn ticks(device: &mut RemoteDevice, seconds: f64, force_n: [f64; 3], mut done: impl FnMut(&RemoteDevice) -> bool) -> bool {
+    let mut period = Period::new(1000.0);
+    let until = monotonic_ns() + (seconds * 1e9) as u64;
+    while monotonic_ns() < until {
+        period.wait();
+        assert_steady(|| {
+            device.read(monotonic_ns());
+            device.write(force_n);
+        });
+        if done(device) {
+            return true;
+        }
+    }
+    false
+}
+
+/// Everything that both libraries have in common.
+fn lives_through_unplugging(kind: Kind, mock: &str) {
+    let path = built(mock, "life");
+    let other = Mock::of(&path);
+    other.plug(false);
+    let options =
+        Options { library: Some(path), mounting: Mounting { origin_mm: [100.0, 0.0, 0.0], ..Mounting::default() }, ..Options::default() };
+    let mut device = open(kind, &options).unwrap();
+    assert!(!ticks(&mut device, 0.3, [0.0; 3], |d| d.status() != DeviceStatus::Unplugged), "there is no device yet");
+    assert!(!device.read(0).valid && device.pose_age_s().is_infinite());
+
+    other.plug(true);
+    assert!(ticks(&mut device, 5.0, [0.0; 3], |d| d.status() == DeviceStatus::Connected), "it is found");
+    let pose = device.read(0);
+    let expected = if kind == Kind::Touch { [101.0, 2.0, 3.0] } else { [110.0, 20.0, 30.0] };
+    for (seen, expected) in pose.position_mm.iter().zip(expected) {
+        assert!((seen - expected).abs() < 1e-9, "{pose:?}");
+    }
+    let velocity = if kind == Kind::Touch { 20.0 } else { 200.0 };
+    assert!((pose.velocity_mm_s.unwrap()[1] - velocity).abs() < 1e-9);
+    // a quarter turn about z
+    let q = device.orientation().unwrap();
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    assert!((q[2].abs() - half).abs() < 1e-9 && (q[2] * q[3] - 0.5).abs() < 1e-9, "{q:?}");
+    assert!((pose.direction[2] - 1.0).abs() < 1e-9);
+
+    // at 1 kHz, both sides
+    let (before, began) = (device.exchanges(), monotonic_ns());
+    ticks(&mut device, 1.0, [0.5, -0.25, 0.125], |_| false);
+    let rate = (device.exchanges() - before) as f64 / ((monotonic_ns() - began) as f64 * 1e-9);
+    println!("{}: {rate:.0} exchanges a second, pose {:.2} ms old", kind.name(), device.pose_age_s() * 1e3);
+    assert!(rate > 100.0, "{rate} a second, on however busy a machine");
+    assert_eq!(other.force(), [0.5, -0.25, 0.125], "the force arrives, after its rise");
+
+    // a tick that hangs: zero force
+    std::thread::sleep(Duration::from_millis(400));
+    assert_eq!(other.force(), [0.0; 3], "a silent tick gives no force");
+
+    // unplugged in mid-run
+    assert!(ticks(&mut device, 1.0, [0.5, 0.0, 0.0], |_| other.force()[0] > 0.0));
+    other.plug(false);
+    assert!(ticks(&mut device, 5.0, [0.5, 0.0, 0.0], |d| d.status() == DeviceStatus::Unplugged), "it is missed");
+    assert!(!device.read(0).valid);
+    other.plug(true);
+    let mut first = None;
+    assert!(
+        ticks(&mut device, 5.0, [0.5, 0.0, 0.0], |d| {
+            if d.status() == DeviceStatus::Connected && first.is_none() {
+                first = Some(other.force()[0]);
+            }
+            other.force()[0] == 0.5 && d.status() == DeviceStatus::Connected
+        }),
+        "it comes back with its whole force"
+    );
+    assert!(first.unwrap() < 0.4, "and that rises: {first:?}");
+    assert_eq!(device.opened(), 2);
+
+    drop(device);
+    assert_eq!(other.force(), [0.0; 3], "what is let go gets no force");
+    assert!(!other.is_open(), "and is closed");
+}
+
+#[test]
+fn a_touch_lives_through_unplugging() {
+    lives_through_unplugging(Kind::Touch, "hd");
+}
+
+#[test]
+fn a_force_dimension_device_lives_through_unplugging() {
+    lives_through_unplugging(Kind::ForceDimension, "dhd");
+}
+
+#[test]
+fn missing_libraries_and_functions_are_named_with_what_to_do() {
+    for kind in [Kind::Touch, Kind::ForceDimension] {
+        let gone = Options { library: Some("/nowhere/lib.so".into()), ..Options::default() };
+        let error = open(kind, &gone).err().expect("refused");
+        assert!(matches!(error, DeviceError::LibraryMissing { .. }) && error.to_string().contains("install"), "{error}");
+        let finding = probe_kind(kind, &gone);
+        assert!(!finding.software && finding.says.contains("was not found"), "{finding:?}");
+    }
+    let path = built("dhd", "probe");
+    let wrong = Options { library: Some(path.clone()), ..Options::default() };
+    let error = open(Kind::Touch, &wrong).err().expect("refused");
+    assert!(error.to_string().contains("hdInitDevice"), "{error}");
+    let found = probe_kind(Kind::ForceDimension, &wrong);
+    assert!(found.software && found.device, "{found:?}");
+    // kept open: a library that nobody holds forgets its state
+    let mock = Mock::of(&path);
+    mock.plug(false);
+    let found = probe_kind(Kind::ForceDimension, &wrong);
+    assert!(found.software && !found.device && found.says.contains("plug it in"), "{found:?}");
+    let hd = Options { library: Some(built("hd", "probe")), ..Options::default() };
+    assert!(probe_kind(Kind::Touch, &hd).software);
+}
+
+#[test]
+fn kinds_are_named_as_scenes_write_them() {
+    for kind in Kind::ALL {
+        assert_eq!(Kind::named(kind.name()), Some(kind));
+    }
+    assert_eq!(Kind::named("mouse"), None);
+}

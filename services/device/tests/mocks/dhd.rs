@@ -1,0 +1,42 @@
+//! A stand-in for libdhd: one device. Built as a shared object by `tests/libraries.rs`.
+#![allow(non_snake_case, clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks)]
+
+use std::ffi::{c_char, c_double, c_int, c_uchar, c_uint};
+use std::sync::Mutex;
+
+struct State { plugged: bool, open: bool, enabled: bool, wrench: [f64; 6], watchdog: u8 }
+static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enabled: false, wrench: [0.0; 6], watchdog: 0 });
+
+fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 } else { -1 } }
+
+#[unsafe(no_mangle)] pub extern "C" fn dhdGetDeviceCount() -> c_int { c_int::from(STATE.lock().unwrap().plugged) }
+#[unsafe(no_mangle)] pub extern "C" fn dhdOpenID(_index: c_char) -> c_int {
+    let mut s = STATE.lock().unwrap();
+    if s.plugged { s.open = true; 3 } else { -1 }
+}
+#[unsafe(no_mangle)] pub extern "C" fn dhdClose(_id: c_char) -> c_int { STATE.lock().unwrap().open = false; 0 }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetPosition(x: *mut c_double, y: *mut c_double, z: *mut c_double, id: c_char) -> c_int {
+    unsafe { *x = 0.01; *y = 0.02; *z = 0.03 };
+    if id == 3 { there() } else { -1 }
+}
+#[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetLinearVelocity(x: *mut c_double, y: *mut c_double, z: *mut c_double, _id: c_char) -> c_int {
+    unsafe { *x = 0.1; *y = 0.2; *z = 0.3 };
+    there()
+}
+#[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetOrientationFrame(frame: *mut [c_double; 3], _id: c_char) -> c_int {
+    // a quarter turn about z, row by row
+    for (n, row) in [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]].iter().enumerate() { unsafe { *frame.add(n) = *row } }
+    there()
+}
+#[unsafe(no_mangle)] pub extern "C" fn dhdSetForceAndTorqueAndGripperForce(fx: c_double, fy: c_double, fz: c_double, tx: c_double, ty: c_double, tz: c_double, _g: c_double, _id: c_char) -> c_int {
+    STATE.lock().unwrap().wrench = [fx, fy, fz, tx, ty, tz];
+    there()
+}
+#[unsafe(no_mangle)] pub extern "C" fn dhdEnableForce(on: c_uchar, _id: c_char) -> c_int { STATE.lock().unwrap().enabled = on == 1; there() }
+#[unsafe(no_mangle)] pub extern "C" fn dhdSetWatchdog(duration: c_uchar, _id: c_char) -> c_int { STATE.lock().unwrap().watchdog = duration; 0 }
+#[unsafe(no_mangle)] pub extern "C" fn dhdGetButtonMask(_id: c_char) -> c_uint { 2 }
+#[unsafe(no_mangle)] pub extern "C" fn dhdErrorGetLastStr() -> *const c_char { c"no device".as_ptr() }
+// for the test
+#[unsafe(no_mangle)] pub extern "C" fn mock_plug(on: c_int) { STATE.lock().unwrap().plugged = on != 0; }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) { for n in 0..3 { unsafe { *to.add(n) = STATE.lock().unwrap().wrench[n] } } }
+#[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { c_int::from(STATE.lock().unwrap().open) }

@@ -1,0 +1,76 @@
+//! A stand-in for libHD: one device that is a mass in the mind of the test. Built as a shared object by `tests/libraries.rs`.
+#![allow(non_snake_case, clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks)]
+
+use std::ffi::{c_char, c_double, c_int, c_uint, c_ushort, c_void};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+struct State {
+    plugged: bool,
+    open: bool,
+    running: bool,
+    error: c_uint,
+    force: [f64; 3],
+    position: [f64; 3],
+    buttons: c_int,
+    frames: u64,
+    next: Option<Instant>,
+}
+static STATE: Mutex<State> = Mutex::new(State {
+    plugged: true, open: false, running: false, error: 0, force: [0.0; 3], position: [1.0, 2.0, 3.0], buttons: 0, frames: 0, next: None,
+});
+
+#[repr(C)]
+pub struct HDErrorInfo { code: c_uint, internal: c_int, device: c_uint }
+
+#[unsafe(no_mangle)] pub extern "C" fn hdInitDevice(_name: *const c_char) -> c_uint {
+    let mut s = STATE.lock().unwrap();
+    if s.plugged { s.open = true; 0 } else { s.error = 0x0301; 0xFFFF_FFFF }
+}
+#[unsafe(no_mangle)] pub extern "C" fn hdDisableDevice(_device: c_uint) { STATE.lock().unwrap().open = false; }
+#[unsafe(no_mangle)] pub extern "C" fn hdMakeCurrentDevice(_device: c_uint) {}
+#[unsafe(no_mangle)] pub extern "C" fn hdBeginFrame(_device: c_uint) {
+    let mut s = STATE.lock().unwrap();
+    if !s.plugged { s.error = 0x0302; }
+}
+#[unsafe(no_mangle)] pub extern "C" fn hdEndFrame(_device: c_uint) { STATE.lock().unwrap().frames += 1; }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn hdGetDoublev(what: c_uint, to: *mut c_double) {
+    let s = STATE.lock().unwrap();
+    let p = s.position;
+    match what {
+        // a quarter turn about z, then the place
+        0x2052 => for (n, v) in [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, p[0], p[1], p[2], 1.0].iter().enumerate() { unsafe { *to.add(n) = *v } },
+        0x2051 => for n in 0..3 { unsafe { *to.add(n) = 10.0 * (n as f64 + 1.0) } },
+        _ => {}
+    }
+}
+#[unsafe(no_mangle)] pub unsafe extern "C" fn hdGetIntegerv(_what: c_uint, to: *mut c_int) { unsafe { *to = STATE.lock().unwrap().buttons } }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn hdSetDoublev(what: c_uint, from: *const c_double) {
+    if what == 0x2700 { for n in 0..3 { let v = unsafe { *from.add(n) }; STATE.lock().unwrap().force[n] = v; } }
+}
+#[unsafe(no_mangle)] pub extern "C" fn hdEnable(_what: c_uint) {}
+#[unsafe(no_mangle)] pub extern "C" fn hdGetError() -> HDErrorInfo {
+    HDErrorInfo { code: std::mem::take(&mut STATE.lock().unwrap().error), internal: 0, device: 0 }
+}
+#[unsafe(no_mangle)] pub extern "C" fn hdStartScheduler() { STATE.lock().unwrap().running = true; }
+#[unsafe(no_mangle)] pub extern "C" fn hdStopScheduler() { STATE.lock().unwrap().running = false; }
+#[unsafe(no_mangle)] pub extern "C" fn hdScheduleSynchronous(call: extern "C" fn(*mut c_void) -> c_uint, data: *mut c_void, _priority: c_ushort) {
+    let due = {
+        let mut s = STATE.lock().unwrap();
+        let now = Instant::now();
+        let due = s.next.map_or(now, |next| (next + Duration::from_millis(1)).max(now));
+        s.next = Some(due);
+        due
+    };
+    std::thread::sleep(due.saturating_duration_since(Instant::now()));
+    // another thread, as the servo loop is
+    let (call, data) = (call as usize, data as usize);
+    std::thread::spawn(move || {
+        let call: extern "C" fn(*mut c_void) -> c_uint = unsafe { std::mem::transmute(call) };
+        call(data as *mut c_void)
+    }).join().unwrap();
+}
+// for the test
+#[unsafe(no_mangle)] pub extern "C" fn mock_plug(on: c_int) { STATE.lock().unwrap().plugged = on != 0; }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) { for n in 0..3 { unsafe { *to.add(n) = STATE.lock().unwrap().force[n] } } }
+#[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { let s = STATE.lock().unwrap(); c_int::from(s.open || s.running) }
