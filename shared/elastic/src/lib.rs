@@ -18,6 +18,7 @@
 mod block;
 mod cell;
 pub mod closed;
+pub mod indentation;
 mod solve;
 
 pub use block::{Block, Fault};
