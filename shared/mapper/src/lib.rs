@@ -30,8 +30,10 @@ pub use sample::Sampling;
 use maille_chainmail::{ChainMail, ChangedRegion};
 use maille_displacement::Inverter;
 use maille_volume::{Brick, BrickId, BrickSource, BrickedVolume, Grid};
+use pieces::Pieces;
 use rayon::prelude::*;
 use rows::{Box3, Cover};
+use search::{Open, OpenVoxels};
 use solve::{Solver, Values, Workspace};
 use std::sync::{Mutex, PoisonError};
 use window::Window;
@@ -257,7 +259,29 @@ where
     Mapper::new().remap(rest, mail, region, sink, options)
 }
 
-/// Rest position [mm, LPS] of the tissue that is now at `world_mm`; `None` outside the grid or where no inverse was found.
+/// Rest position [mm, LPS] of the tissue that is now at `world_mm`, piece by piece as the mapper sees it: right beside voids and
+/// cuts as well. `None` outside the grid and where no tissue, nor the partial volume around it, is now.
+pub fn tissue_rest_position<S: BrickSource + ?Sized>(rest: &S, mail: &ChainMail, world_mm: [f64; 3]) -> Option<[f64; 3]> {
+    let grid = &rest.info().grid;
+    let index = grid.index_from_world(world_mm);
+    if !grid.contains_index(index) {
+        return None;
+    }
+    let low = index.map(|v| v as usize);
+    let range = Box3 { low, high: std::array::from_fn(|c| (low[c] + 1).min(grid.size[c] - 1)) };
+    let (mut window, mut pieces, mut open) = (Window::new(), Pieces::default(), OpenVoxels::new());
+    window.gather(mail, reach::preimage_box_beside_gaps(mail, range, &mail.loaded_bricks()));
+    pieces.gather(rest, mail, &window);
+    let target = std::array::from_fn(|c| (index[c] - window.low()[c] as f64) as f32);
+    open.add(Open::new([0; 3], target, target));
+    open.search(&window, &pieces, target, 1e-3);
+    let found = open.all[0].found()?;
+    let position: [f64; 3] = std::array::from_fn(|c| index[c] + f64::from(found[c] - target[c]));
+    grid.contains_index(position).then(|| grid.world_from_index(position))
+}
+
+/// Rest position [mm, LPS] of the tissue that is now at `world_mm` where all links exist; `None` outside the grid or where no inverse was
+/// found. Beside voids and cuts: [`tissue_rest_position`].
 pub fn rest_position(mail: &ChainMail, grid: &Grid, world_mm: [f64; 3]) -> Option<[f64; 3]> {
     let index = grid.index_from_world(world_mm);
     if !grid.contains_index(index) {

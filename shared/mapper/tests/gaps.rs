@@ -1,7 +1,7 @@
 //! Voids, cuts and folds: what opens is air, what closes is tissue, nothing else changes; and where bricks end nothing shows.
 
 use maille_chainmail::{Admission, CUT, ChainMail, DisplacementBrick, Motion, Pin, Tissue};
-use maille_mapper::{MapOptions, MapReport, Mapper, remap};
+use maille_mapper::{MapOptions, MapReport, Mapper, remap, tissue_rest_position};
 use maille_volume::{BrickId, BrickSource, BrickedVolume, Grid, Rescale, Volume, brick::EDGE};
 
 const AIR: i16 = -1000;
@@ -84,6 +84,21 @@ fn a_cut_drawn_apart_shows_air_between_its_sides_and_tissue_everywhere_else() {
             }
         }
     }
+    // what is felt is what is seen: tissue on either side, nothing in the gap
+    let back = |i: f64| tissue_rest_position(&rest, &mail, [i, 10.2, 9.7]);
+    for now in [17.0, 22.5, 2.0] {
+        let found = back(now).unwrap();
+        // the sides next to the cut move as one, elsewhere u is linear: X + u(X) = x is known to rounding
+        let expected = if now == 17.0 {
+            7.0 + 10.0 / (1.0 - 1.75 / 12.0)
+        } else if now == 22.5 {
+            32.0 - 9.5 / (1.0 - 1.75 / 12.0)
+        } else {
+            now
+        };
+        assert!((found[0] - expected).abs() < 2e-3 && (found[1] - 10.2).abs() < 2e-3, "{now}: {found:?}, {expected}");
+    }
+    assert_eq!((back(19.0), back(20.5)), (None, None));
     // 19.5 ± 1.75 holds the planes 18 to 21
     assert_eq!((air, report.voids, report.failures), (4 * 400, 4 * 400, 0));
 }
