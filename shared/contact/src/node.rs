@@ -6,7 +6,8 @@
 //! the rate of commits. So tissue resists by how far it was pushed from where the ball first met it. Withdrawn, the ball leaves a dent: with
 //! a gap g between ball and tissue, m fades by exp(−Δg / 1.5 mm) while g grows, so the force ends near the dent that is seen
 //! (a dent that springs back in further commits instead lowers m and raises d, and is felt as elastic). Sliding along the
-//! surface by t lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. At δ = 0 the contact ends and m is forgotten. What is no
+//! surface by t lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. A gap above 0.3 mm, which no push leaves, lets m fall by itself: tissue
+//! that went away (exhaling) is let go within some 0.1 s. At δ = 0 the contact ends and m is forgotten. What is no
 //! pushing is carried in a second term β that goes to 0 within 0.1 s, δ = max(0, d + m + β): a
 //! surface that comes towards the ball (relaxing or breathing tissue) beyond where it was met, a new threshold, a foot that
 //! jumps to a nearer wall. So all of these are felt, and none as a step.
@@ -33,8 +34,10 @@ use crate::{
 const BIAS_S: f64 = 0.1;
 /// Growth of the gap over which a give-way is forgotten [mm].
 const GAP_MM: f64 = 1.5;
+/// Gap that resampling may leave below a tip that pushed the tissue [mm]: beyond it the tissue went away by itself.
+const OWN_GAP_MM: f64 = 0.3;
 /// Time constant of the material under the tip [s]: a tip that slides from mucosa to bone feels no step.
-const MATERIAL_S: f64 = 0.01;
+const MATERIAL_S: f64 = 0.025;
 /// Depth over which damping sets in [mm], so that touching is no step.
 const DAMPING_DEPTH_MM: f64 = 0.5;
 /// The material is read this far below the surface [mm]: at the surface itself every tissue has the threshold's value.
@@ -152,9 +155,10 @@ impl Node {
         if self.last_point.is_some() {
             let change = before.filter(|_| blend.is_some()).map(|before| before - d);
             self.carry(change, now.committed && !now.other_surface, d, point, now.dt);
-        } else if moved {
-            // already pressed where it is found first: felt gradually
-            self.bias = -d.max(0.0);
+        } else if moved || now.committed || now.other_surface {
+            // already pressed where it is found first, or met by tissue that came: felt gradually, but for what the hand's own motion did
+            let own = before.filter(|_| !moved).unwrap_or(0.0).max(0.0);
+            self.bias = -(d - own).max(0.0);
         }
         let delta = (d + self.give_way + self.bias).max(0.0);
         if delta <= 0.0 && d <= 0.0 {
@@ -197,6 +201,8 @@ impl Node {
             self.give_way *= ((self.gap - gap) / GAP_MM).exp();
             self.gap = gap;
         }
+        // tissue that has gone away from the tip was not pushed there: let go within the same time as what comes
+        self.give_way = (self.give_way - (gap - OWN_GAP_MM).max(0.0) * dt / BIAS_S).max(0.0);
         self.bias = (self.bias * (-dt / BIAS_S).exp()).clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
         self.give_way = self.give_way.min(MAX_GIVE_WAY_MM);
     }

@@ -21,7 +21,8 @@
 //! controller then lets the wall give way rather than feed it.
 //!
 //! **Reference.** What counts as stored is at most the elastic energy that the contact reports plus a reserve, so an hour of dissipation
-//! does not license minutes of buzzing [a bounded reference for the energy: Ryu et al. 2005]. Work done by tissue that moves by itself is granted (`grant`).
+//! does not license minutes of buzzing [a bounded reference for the energy: Ryu et al. 2005]. Work done by tissue that moves by itself is granted
+//! within a credit (`grant`).
 //!
 //! Units: mm, N, s, kg. Cost: proportional to the delay in ticks, at most 31. Allocation: none. Not here: choosing gains that
 //! need no controller (`coupling`).
@@ -38,6 +39,8 @@ const ADVANCE_MJ: f64 = 0.5;
 const SLACK: f64 = 0.5;
 /// Part of the sum of the largest rounding errors that counts as doubt.
 const DOUBT: f64 = 0.3;
+/// Most work of moving tissue that may be out [mJ]: 1 N over a breath of 10 mm.
+const CREDIT_MJ: f64 = 10.0;
 /// Time in which a lowered force comes back [s].
 const SHARE_S: f64 = 0.02;
 
@@ -80,6 +83,8 @@ pub struct Passivity {
     lowered: u64,
     /// λ of the last tick
     share: f64,
+    /// work of tissue granted and not given back [mJ]
+    credit_mj: f64,
     /// sum of the largest errors of E by rounding [mJ]
     doubt_mj: f64,
     /// sum of their variances [mJ²]
@@ -116,6 +121,7 @@ impl Passivity {
             dissipated_mj: 0.0,
             lowered: 0,
             share: 1.0,
+            credit_mj: 0.0,
             doubt_mj: 0.0,
             doubt_squared: 0.0,
         }
@@ -147,10 +153,13 @@ impl Passivity {
         self.velocity.reset();
     }
 
-    /// Work [mJ] that moving tissue does on the hand: no fault of the rendering, so it may be given out.
+    /// Work [mJ] that tissue does on the hand by moving: it may be given out, on credit of [`CREDIT_MJ`] that what the hand gives back
+    /// later restores. So breathing tissue is felt, and tissue that is moved to and fro in the wrong moments cannot pump.
     pub fn grant(&mut self, work_mj: f64) {
-        if work_mj > 0.0 {
-            self.energy_mj += work_mj;
+        let work = work_mj.min(CREDIT_MJ - self.credit_mj);
+        if work > 0.0 {
+            self.credit_mj += work;
+            self.energy_mj += work;
         }
     }
 
@@ -178,6 +187,7 @@ impl Passivity {
         let surplus = self.certain_mj() - (elastic_mj + self.reserve_mj);
         if surplus > 0.0 {
             self.energy_mj -= surplus;
+            self.credit_mj = (self.credit_mj - surplus).max(0.0);
         }
         let per_mass = 1000.0 / self.port.mass_kg;
         let delay = self.port.delay_ticks;
@@ -197,8 +207,10 @@ impl Passivity {
         let mut force = wanted;
         let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
         if deficit > 0.0 && wanted.norm_squared() > 0.0 {
-            let alpha = deficit * self.max_damping_n_s_per_mm;
-            self.dissipated_mj += alpha * estimate.smooth.norm_squared() * dt_s;
+            let speed = estimate.smooth.norm();
+            // at most as large as the force itself: touching is no step, and tissue never pulls
+            let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed > 0.0 { wanted.norm() / speed } else { 0.0 });
+            self.dissipated_mj += alpha * speed * speed * dt_s;
             force -= estimate.smooth * alpha;
         }
         let out = (force.dot(&velocity) + force.norm() * slack) * dt_s;

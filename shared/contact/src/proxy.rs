@@ -12,7 +12,8 @@
 //! n comes from the interpolated gradient and is continuous along the surface.
 //!
 //! In the air the foot is found by 26 probes around the tip, slightly beyond r, every tick; inside, by going back to the
-//! last position outside (thesis fig. 3.17). A tip whose centre is inside tissue without having come
+//! last position outside (thesis fig. 3.17). A tip that was pushed through a thin wall is in air again, but of another cavity: as long as
+//! tissue lies on the segment from its foot to its centre it is held as if inside, and that air is not outside. A tip whose centre is inside tissue without having come
 //! from outside (start, jump, a new threshold) is *buried*: no contact until the centre has been in air.
 //!
 //! Invariants: bounded work (`limits`); never NaN; a lost foot is reported, not guessed.
@@ -129,7 +130,7 @@ impl Proxy {
     pub fn update_within<S: Surface + ?Sized>(&mut self, tissue: &S, at: [f64; 3], search: bool) -> Touch {
         let Some(x) = finite(at) else { return self.touch(V3::zeros(), false) };
         let inside = is_inside(tissue, x);
-        let mut moved = false;
+        let (mut moved, mut beyond) = (false, false);
         match self.state {
             State::Buried => {
                 if !inside {
@@ -152,17 +153,19 @@ impl Proxy {
                     Some(foot) if height(x, &foot) <= self.reach(tissue) + KEEP_GAP_MM => State::Near(foot),
                     _ => State::Free,
                 };
+                // in the air, but of another cavity: held from behind, as inside
+                beyond = !inside && found.is_some_and(|foot| !in_sight(tissue, &foot, x));
                 if inside {
                     if found.is_none() {
                         moved = true;
                         self.find_from_inside(tissue, x);
                     }
-                } else {
+                } else if search && !beyond {
                     moved |= self.find_nearer(tissue, x);
                 }
             }
         }
-        if !inside && !matches!(self.state, State::Buried) {
+        if !inside && !beyond && !matches!(self.state, State::Buried) {
             self.outside = Some(x);
         }
         self.touch(x, moved)
@@ -273,6 +276,16 @@ fn level<S: Surface + ?Sized>(tissue: &S, at: V3) -> Option<f64> {
 
 fn is_inside<S: Surface + ?Sized>(tissue: &S, at: V3) -> bool {
     level(tissue, at).is_some_and(|l| l >= 0.0)
+}
+
+/// Whether no tissue lies between a foot and `x`.
+fn in_sight<S: Surface + ?Sized>(tissue: &S, foot: &Foot, x: V3) -> bool {
+    let half_voxel = 0.5 * tissue.resolution_mm();
+    // from a little above the surface: on it, rounding decides
+    let from = foot.point + foot.normal * (0.5 * half_voxel);
+    let way = x - from;
+    let steps = ((way.norm() / half_voxel).ceil() as usize).clamp(1, MAX_BACK_STEPS);
+    (0..steps).all(|n| !is_inside(tissue, from + way * (n as f64 / steps as f64)))
 }
 
 /// The surface between `start + direction·a` (inside) and `start + direction·b` (outside). A side out of the volume is no

@@ -163,3 +163,107 @@ fn a_hand_that_dents_voxels_feels_a_steady_push() {
     // the tip has made its room: what is left is the dent's rounded bottom
     assert!(last_depth < 0.3, "{last_depth} mm left");
 }
+
+/// A wall that breathes in commits at 10, 30 and 90 Hz against a tip at rest, in contact and out of it: no step of the force, at the rate of the
+/// commits or any other, beyond what the wall's own speed explains.
+#[test]
+fn breathing_tissue_is_not_felt_at_the_rate_of_its_commits() {
+    for every in [100, 33, 11] {
+        let mut d = Driver::new(plain(2.0, SPRING));
+        let (mut last, mut largest, mut felt, mut free) = (0.0f64, 0.0f64, 0u32, 0u32);
+        for n in 0..12_000u64 {
+            // ±3 mm in 4 s: 4.7 mm/s at most
+            let committed = (n / every * every) as f64 * 1e-3;
+            let height = 3.0 * (committed * std::f64::consts::FRAC_PI_2).sin();
+            let z = if n < 500 { 8.0 - 0.01 * n as f64 } else { 3.0 };
+            let f = d.tick(&wall(height), n / every, V3::new(0.0, 0.0, z)).force_n[2];
+            if n > 600 {
+                largest = largest.max((f - last).abs());
+                felt += u32::from(f > 0.1);
+                free += u32::from(f == 0.0);
+            }
+            last = f;
+        }
+        // 0.5 N/mm · 4.7 mm/s · 1 ms = 0.0024 N a tick; held back by a commit's interval and let in within 0.1 s it is at most some four times that
+        assert!(largest < 0.01, "every {every} ms: a step of {largest} N");
+        assert!(felt > 3000 && free > 1000, "every {every} ms: felt {felt}, free {free}");
+    }
+}
+
+/// A generator of numbers from 0 to 1.
+fn randoms(mut seed: u64) -> impl FnMut() -> f64 {
+    move || {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (seed >> 33) as f64 / (1u64 << 31) as f64
+    }
+}
+
+/// Moves a tip about over a wall that `commit(height, depth of the tip, force, tip)` moves at random times. The most energy that was out at any
+/// time, and the most that was in [mJ].
+fn pumped(
+    config: HapticConfig,
+    ticks: u64,
+    random: &mut impl FnMut() -> f64,
+    mut commit: impl FnMut(f64, f64, f64, f64, f64) -> f64,
+) -> (f64, f64) {
+    let mut d = Driver::new(config);
+    let (rate, amplitude) = (2.0 + 10.0 * random(), 1.0 + 3.0 * random());
+    let (mut height, mut epoch, mut next) = (0.0f64, 1, 0);
+    let (mut out_mj, mut most, mut held, mut last) = (0.0f64, 0.0f64, 0.0f64, None::<(f64, f64)>);
+    for n in 0..ticks {
+        let z = 1.0 + amplitude * (n as f64 * 1e-3 * rate).cos();
+        if n >= next {
+            height = commit(height, (height + 2.0 - z).max(0.0), last.map_or(0.0, |l| l.1), z, random());
+            epoch += 1;
+            next = n + 5 + (100.0 * random()) as u64;
+        }
+        let out = d.tick(&wall(height), epoch, V3::new(0.0, 0.0, z));
+        if let Some((last_z, force)) = last {
+            out_mj += force * (z - last_z);
+        }
+        most = most.max(out_mj);
+        held = held.max(-out_mj);
+        last = Some((z, out.force_n[2]));
+    }
+    (most, held)
+}
+
+/// Tissue that gives way at any time, by any part of the tip's depth, and springs back when the tip has left it, feeds nobody.
+#[test]
+fn tissue_that_gives_way_at_random_never_feeds_the_hand() {
+    let mut random = randoms(99);
+    for _ in 0..20 {
+        let (most, held) = pumped(plain(2.0, SPRING), 4000, &mut random, |height, depth, force, z, r| match force > 0.0 {
+            true => height - depth * r,
+            false if z > 2.5 => 0.0,
+            false => height,
+        });
+        // a spring held between ticks gives K/2 dx² a tick in passing, and a blend as much for its 20 ms
+        assert!(most < 0.3 && held > 0.3, "{most} mJ out of {held} mJ held");
+    }
+}
+
+/// Tissue that moves as if to pump the tip, up when it is pressed and down when it leaves, does work, as a beating heart would: with the
+/// passivity controller on never more than what is granted to tissue (10 mJ) and to the controller.
+#[test]
+fn with_the_controller_on_no_sequence_of_commits_feeds_the_hand_for_long() {
+    let mut random = randoms(7);
+    let mut pumped_most = 0.0f64;
+    for n in 0..8 {
+        let run = |passivity, random: &mut _| {
+            pumped(HapticConfig { passivity, ..plain(2.0, SPRING) }, 30_000, random, |height, depth, _, _, r| {
+                if n % 2 == 0 {
+                    -4.0 + 5.0 * r
+                } else if depth > 0.2 {
+                    height + 1.0
+                } else {
+                    height - 1.0
+                }
+            })
+        };
+        let (on, off) = (run(true, &mut random).0, run(false, &mut random).0);
+        pumped_most = pumped_most.max(off);
+        assert!(on < 11.0, "{on} mJ, {off} mJ without the controller");
+    }
+    assert!(pumped_most > 20.0, "the commits do pump: {pumped_most} mJ");
+}

@@ -5,7 +5,7 @@ mod common;
 use common::*;
 use maille_contact::{
     Coupling, Device, DevicePose, Easing, Faults, Grip, HapticConfig, HapticCore, Isosurface, Path, PathDevice, SimulatedHand, TickInputs,
-    TickOutputs, WayPoint,
+    TickOutputs, ToolShape, WayPoint,
 };
 use maille_realtime::{CountingAllocator, assert_steady};
 use maille_volume::BrickedVolume;
@@ -253,5 +253,84 @@ proptest! {
             prop_assert!((f - last).norm() <= MAX_STEP_N + 1e-9);
             last = f;
         }
+    }
+}
+
+/// The same for tools of several balls, with the passivity controller on and torque: hostile poses, orientations and times.
+#[test]
+fn tools_of_several_balls_are_bounded_whatever_comes() {
+    let volume = ball();
+    let tissue = Isosurface::new(&volume, 0.0);
+    for shape in [ToolShape::capsule(2.0, 25.0), ToolShape::probe(40.0, 60.0, 8.0)] {
+        let config = HapticConfig {
+            shape,
+            passivity: true,
+            pose_delay_ticks: 2,
+            max_torque_n_mm: 150.0,
+            max_torque_slew_n_mm_per_s: 3000.0,
+            ..config()
+        };
+        let mut core = HapticCore::new(config);
+        let (mut last, mut last_torque, mut now_ns, mut seed) = (V3::zeros(), V3::zeros(), 5_000_000_000u64, 7u64);
+        let mut random = move || {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (seed >> 33) as f64 / (1u64 << 31) as f64
+        };
+        let mut felt = 0;
+        for n in 0..6000u64 {
+            let hostile = n % 600 < 200;
+            let bad = [f64::NAN, f64::INFINITY, -1e300, 100.0][(random() * 4.0) as usize];
+            let t = n as f64 * 1e-3;
+            let mut at = V3::new(3.0 * t.sin(), 0.0, 12.5 + 2.0 * (t * 3.0).cos());
+            let mut direction = V3::new(0.3 * t.cos(), 0.2, -1.0);
+            let mut q = [0.0, 0.0, (t * 0.3).sin(), (t * 0.3).cos()];
+            if hostile && random() < 0.3 {
+                at[(random() * 3.0) as usize] = bad;
+            }
+            if hostile && random() < 0.3 {
+                direction[(random() * 3.0) as usize] = bad;
+            }
+            if hostile && random() < 0.3 {
+                q[(random() * 4.0) as usize] = bad;
+            }
+            if hostile && random() < 0.2 {
+                now_ns = now_ns.saturating_add_signed((random() * 2e9) as i64 - 1_000_000_000);
+            }
+            now_ns += 1_000_000;
+            if n % 3 == 0 {
+                core.set_orientation(q);
+            }
+            let mut pose = pose(at);
+            (pose.direction, pose.valid) = (direction.into(), !(hostile && random() < 0.1));
+            let out = core.tick(&TickInputs {
+                now_ns,
+                pose,
+                pose_age_s: if hostile && random() < 0.1 { f64::NAN } else { 0.0 },
+                tissue: Some(&tissue),
+                epoch: n / 30,
+                tissue_age_s: 0.0,
+                release: false,
+            });
+            let (f, torque) = (V3::from(out.force_n), V3::from(out.torque_n_mm));
+            assert!(f.iter().chain(&torque).all(|c| c.is_finite()), "{n}");
+            assert!(f.norm() <= MAX_FORCE_N + 1e-9 && torque.norm() <= 150.0 + 1e-9, "{n}: {f:?} {torque:?}");
+            // a fall for passivity's sake may be steeper than the slew limit, a rise never
+            assert!(f.norm() - last.norm() <= MAX_STEP_N + 1e-9 && torque.norm() - last_torque.norm() <= 3.0 + 1e-9, "{n}: {last:?} {f:?}");
+            (last, last_torque) = (f, torque);
+            felt += u32::from(f.norm() > 0.05);
+        }
+        let faults = core
+            .tick(&TickInputs {
+                now_ns,
+                pose: pose(V3::zeros()),
+                pose_age_s: 0.0,
+                tissue: Some(&tissue),
+                epoch: 0,
+                tissue_age_s: 0.0,
+                release: false,
+            })
+            .faults;
+        assert!(faults.invalid_poses > 300 && faults.jumps > 30 && faults.time_backwards > 30, "{faults:?}");
+        assert!(felt > 500, "it recovers each time: {felt} ticks felt");
     }
 }
