@@ -39,7 +39,7 @@ impl<S: BrickSource + ?Sized> Propagation<'_, S> {
                 if wanted <= now {
                     continue;
                 }
-                let bound = self.elements.limits(neighbour.slot).bound[neighbour.at];
+                let bound = self.elements.limits(neighbour.slot).bound_of(neighbour.at);
                 if wanted > bound {
                     held.push(neighbour.voxel);
                     refused |= wanted > bound + self.slack;

@@ -12,7 +12,7 @@ use crate::{
     state::{Elements, Model},
 };
 use maille_volume::BrickSource;
-use std::collections::{BinaryHeap, HashMap};
+use std::collections::{BinaryHeap, HashMap, HashSet};
 
 /// Replaces the targets of one component, in place.
 pub fn make_consistent<S: BrickSource + ?Sized>(
@@ -59,10 +59,15 @@ fn envelope<S: BrickSource + ?Sized>(
         *slot = slot.max(value);
         heap.push((Ordered(value), *voxel));
     }
+    // values only fall: what is popped is settled, and when all pins are, nothing that is left can matter
+    let mut unsettled: HashSet<[usize; 3]> = voxels.iter().copied().collect();
     let mut linked = [Neighbour::default(); MOST];
     while let Some((Ordered(value), voxel)) = heap.pop() {
         if value < best[&voxel] {
             continue;
+        }
+        if unsettled.remove(&voxel) && unsettled.is_empty() {
+            break;
         }
         let count = neighbours(elements, rest, model, rules, voxel, &mut linked);
         for next in &linked[..count] {

@@ -1,7 +1,9 @@
-//! Which elements a tool takes hold of: the eight around a point [Dräger 2005, 3.5.3], or those in a sphere.
+//! Which elements a tool takes hold of: the eight around a point [Dräger 2005, 3.5.3], those in a sphere, or those
+//! in a capsule.
 //!
 //! Positions are rest positions: on deformed tissue ask for the pre-image of the tool first (`maille_mapper::rest_position`).
 
+use crate::Capsule;
 use maille_volume::Grid;
 
 /// The up to eight voxels of the grid around a rest position [mm, LPS]; fewer at the border, none outside or for NaN.
@@ -44,6 +46,35 @@ pub fn elements_in_sphere(grid: &Grid, center_mm: [f64; 3], radius_mm: f64) -> V
                 let distance2: f64 = (0..3).map(|c| (([i, j, k][c] as f64 - index[c]) * grid.spacing[c]).powi(2)).sum();
                 if distance2 <= radius_mm * radius_mm {
                     out.push([i, j, k]);
+                }
+            }
+        }
+    }
+    out
+}
+
+/// All voxels whose centres lie within `radius_mm` of the segment a–b [mm, LPS], i fastest: what a straight tool takes hold of.
+pub fn elements_in_capsule(grid: &Grid, a_mm: [f64; 3], b_mm: [f64; 3], radius_mm: f64) -> Vec<[usize; 3]> {
+    let place = |world: [f64; 3]| {
+        let index = grid.index_from_world(world);
+        std::array::from_fn(|c| index[c] * grid.spacing[c])
+    };
+    let capsule = Capsule { a: place(a_mm), b: place(b_mm), radius_mm };
+    if !(capsule.a.iter().chain(&capsule.b).all(|v| v.is_finite()) && radius_mm >= 0.0) {
+        return Vec::new();
+    }
+    let range = |c: usize| {
+        let low = (capsule.a[c].min(capsule.b[c]) - radius_mm) / grid.spacing[c];
+        let high = (capsule.a[c].max(capsule.b[c]) + radius_mm) / grid.spacing[c];
+        low.ceil().max(0.0) as usize..(high.floor() + 1.0).clamp(0.0, grid.size[c] as f64) as usize
+    };
+    let mut out = Vec::new();
+    for k in range(2) {
+        for j in range(1) {
+            for i in range(0) {
+                let at = [i, j, k];
+                if capsule.depth(std::array::from_fn(|c| at[c] as f64 * grid.spacing[c])) >= 0.0 {
+                    out.push(at);
                 }
             }
         }

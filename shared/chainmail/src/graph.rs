@@ -47,7 +47,14 @@ pub fn neighbours<S: BrickSource + ?Sized>(
     let mut count = 0;
     for side in 0..6 {
         let Some(next) = step(size, voxel, side) else { continue };
-        let (next_slot, next_at) = place(elements, rest, model, next);
+        // most neighbours lie in the same brick
+        let axis = side / 2;
+        let (next_slot, next_at) = if voxel[axis] / EDGE == next[axis] / EDGE {
+            let stride = [1, EDGE, EDGE * EDGE][axis];
+            (slot, if side % 2 == 1 { at + stride } else { at - stride })
+        } else {
+            place(elements, rest, model, next)
+        };
         let there = elements.limits(next_slot).of(next_at);
         let (low, high) = if side % 2 == 1 { (here, there) } else { (there, here) };
         let limit = rules.side(side).limit(side / 2, low, high);
@@ -57,60 +64,61 @@ pub fn neighbours<S: BrickSource + ?Sized>(
         }
     }
     if model.links.metric == Metric::Round && here.0 < f32::INFINITY {
-        for n in 0..27usize {
-            let towards = [n % 3, n / 3 % 3, n / 9];
-            if towards.iter().filter(|&&t| t != 1).count() >= 2
-                && let Some(neighbour) = diagonal(elements, rest, model, rules, voxel, towards)
-            {
-                out[count] = neighbour;
-                count += 1;
-            }
-        }
+        count += diagonals(elements, rest, model, rules, voxel, &mut out[count..]);
     }
     count
 }
 
-/// The diagonal neighbour in a direction (0 down, 1 none, 2 up, by axis), if it is linked.
-fn diagonal<S: BrickSource + ?Sized>(
+/// The diagonal neighbours, into `out`; their number.
+fn diagonals<S: BrickSource + ?Sized>(
     elements: &mut Elements,
     rest: &S,
     model: &Model,
     rules: &Rules,
     voxel: [usize; 3],
-    towards: [usize; 3],
-) -> Option<Neighbour> {
+    out: &mut [Neighbour],
+) -> usize {
     let size = elements.layout().size;
-    let (mut low, mut high, mut length2) = (voxel, voxel, 0.0f32);
-    for c in (0..3).filter(|&c| towards[c] != 1) {
-        if towards[c] == 2 {
-            high[c] += 1;
-        } else {
-            low[c] = low[c].checked_sub(1)?;
+    // all around once: voxel, place, offset and flags; 0 down, 1 none, 2 up, by axis
+    let mut around = [None; 27];
+    for (n, slot) in around.iter_mut().enumerate() {
+        let at = [voxel[0] + n % 3, voxel[1] + n / 3 % 3, voxel[2] + n / 9];
+        if (0..3).all(|c| at[c] >= 1 && at[c] <= size[c]) {
+            let at = at.map(|v| v - 1);
+            let place = place(elements, rest, model, at);
+            *slot = Some((at, place, elements.limits(place.0).of(place.1)));
         }
-        length2 += rules.side(2 * c + towards[c] / 2).length.powi(2);
     }
-    if (0..3).any(|c| high[c] >= size[c]) {
-        return None;
-    }
-    // the whole block holds together
     let thin = SLENDER.iter().fold(0, |a, b| a | b);
-    for n in 0..8usize {
-        let corner = [n & 1, n >> 1 & 1, n >> 2];
-        if (0..3).any(|c| corner[c] == 1 && low[c] == high[c]) {
+    let mut count = 0;
+    for (n, there) in around.iter().enumerate() {
+        let towards = [n % 3, n / 3 % 3, n / 9];
+        let Some((other, place, (offset, _))) = *there else { continue };
+        if towards.iter().filter(|&&t| t != 1).count() < 2 {
             continue;
         }
-        let at: [usize; 3] = std::array::from_fn(|c| low[c] + corner[c]);
-        let (slot, at) = place(elements, rest, model, at);
-        let (offset, flags) = elements.limits(slot).of(at);
-        let cut = (0..3).any(|c| flags & CUT[c] != 0 && corner[c] == 0 && low[c] < high[c]);
-        if offset.is_infinite() || cut || flags & thin != 0 {
-            return None;
+        let (mut low, mut length2) = ([1; 3], 0.0f32);
+        for c in (0..3).filter(|&c| towards[c] != 1) {
+            low[c] = towards[c] / 2;
+            length2 += rules.side(2 * c + towards[c] / 2).length.powi(2);
+        }
+        let holds = (0..8usize).all(|m| {
+            let corner = [m & 1, m >> 1 & 1, m >> 2];
+            if (0..3).any(|c| corner[c] == 1 && towards[c] == 1) {
+                return true;
+            }
+            let at: [usize; 3] = std::array::from_fn(|c| low[c] + corner[c]);
+            around[(at[2] * 3 + at[1]) * 3 + at[0]].is_some_and(|(_, _, (offset, flags))| {
+                let cut = (0..3).any(|c| flags & CUT[c] != 0 && corner[c] == 0 && towards[c] != 1);
+                offset.is_finite() && !cut && flags & thin == 0
+            })
+        });
+        if let (true, Some((_, _, (here, _)))) = (holds, around[13]) {
+            out[count] = Neighbour { voxel: other, slot: place.0, at: place.1, limit: link_limit(here, offset, length2.sqrt()) };
+            count += 1;
         }
     }
-    let other: [usize; 3] = std::array::from_fn(|c| low[c] + high[c] - voxel[c]);
-    let (here, there) = (place(elements, rest, model, voxel), place(elements, rest, model, other));
-    let (a, b) = (elements.limits(here.0).offset[here.1], elements.limits(there.0).offset[there.1]);
-    Some(Neighbour { voxel: other, slot: there.0, at: there.1, limit: link_limit(a, b, length2.sqrt()) })
+    count
 }
 
 /// The neighbour on a side (axis·2, +1 upwards), inside `size`.

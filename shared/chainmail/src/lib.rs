@@ -20,6 +20,10 @@
 //! the chain regions are. The admissible part of a push is its clamp to ±M, M(x) = min_y (m(y) + d(x, y)) with m = 0 on
 //! bone, found only where the push reaches ([`Admission`] says whether by component or along the push).
 //!
+//! Links may differ by axis and direction, run through tissue only, close voids and open cuts: the `links` module and [`LinkModel`]. They may
+//! change while tissue is deformed: [`ChainMail::repair`]. In idle time tissue goes back towards rest: [`ChainMail::relax_elastic`]. What
+//! the thesis and its forerunners do instead is in [`reference`](mod@reference).
+//!
 //! Units and frame: u in mm *along the grid's axes* (not LPS); `maille_displacement::in_patient` rotates. `f32`.
 //! Invariants: after every push all links hold up to rounding (a few ulp of |u|), bone has u = 0 bit for bit, |u_c| ≤ m. Subtraction of
 //! floats is monotone, so the result is the same bits whatever the order of propagation.
@@ -37,6 +41,7 @@ mod elements;
 mod from_rest;
 mod graph;
 mod intersection;
+mod knobs;
 mod links;
 mod mail;
 mod propagate;
@@ -52,8 +57,9 @@ mod tissue;
 
 pub use brick::{DisplacementBrick, ELEMENTS};
 pub use cut::{Triangle, swept_blade};
-pub use elements::{elements_in_sphere, enclosing_elements};
+pub use elements::{elements_in_capsule, elements_in_sphere, enclosing_elements};
 pub use intersection::intersection_search;
+pub use knobs::{KNOBS, Knob, knob};
 pub use links::{AxisLimits, CUT, Gaps, LinkModel, Metric, Slender};
 pub use mail::{ChainMail, Motion, Pin, PushOutcome};
 pub use region::{ChangedBrick, ChangedRegion};

@@ -196,15 +196,17 @@ impl ChainMail {
         (offset, bound)
     }
 
-    /// Limits [mm] of the link from a voxel p to its next q along `axis`, for component `c` of the displacement: how far u_c(p) may exceed
+    /// Limits [mm] of the link from a voxel p to its next q along `axis`, for each component of the displacement: how far u_c(p) may exceed
     /// u_c(q), and u_c(q) exceed u_c(p). Infinite where nothing holds them. Both voxels lie in the grid.
-    pub fn directed_link<S: BrickSource + ?Sized>(&self, rest: &S, voxel: [usize; 3], axis: usize, c: usize) -> [f32; 2] {
+    pub fn directed_links<S: BrickSource + ?Sized>(&self, rest: &S, voxel: [usize; 3], axis: usize) -> [[f32; 2]; 3] {
         let mut next = voxel;
         next[axis] += 1;
-        let rules = Rules::new(&self.model.links, self.spacing(), c, 1.0);
         let of = |v: [usize; 3]| (self.limits(rest, v).0, self.flags(rest, v));
         let (low, high) = (of(voxel), of(next));
-        [rules.up[axis].limit(axis, low, high), rules.down[axis].limit(axis, low, high)]
+        std::array::from_fn(|c| {
+            let rules = Rules::new(&self.model.links, self.spacing(), c, 1.0);
+            [rules.up[axis].limit(axis, low, high), rules.down[axis].limit(axis, low, high)]
+        })
     }
 
     /// Cuts and thinness of an element, as its brick's limits have them.

@@ -140,7 +140,7 @@ impl ChainMail {
             let [i, j, k] = pin.voxel;
             let slot = self.elements.load_with_limits(rest, &self.model, self.layout().brick_of(i, j, k));
             let (limits, n) = (self.elements.limits(slot), DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE));
-            if limits.bound[n] == 0.0 || limits.offset[n].is_infinite() {
+            if limits.bound_of(n) == 0.0 || limits.offset[n].is_infinite() {
                 continue;
             }
             let here = self.displacement(pin.voxel);
@@ -176,7 +176,7 @@ impl ChainMail {
             let tolerated = if sign * target > sign * before[n][c] { 0.0 } else { 2.0 * slack };
             let slot = self.elements.load_with_limits(rest, &self.model, self.layout().brick_of(i, j, k));
             let n = DisplacementBrick::offset(i % EDGE, j % EDGE, k % EDGE);
-            let bound = self.elements.limits(slot).bound[n];
+            let bound = self.elements.limits(slot).bound_of(n);
             let here = self.elements.brick(slot).displacement.u[c][n];
             if sign * target <= sign * here + tolerated {
                 continue;

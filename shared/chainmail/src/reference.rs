@@ -11,6 +11,10 @@
 //! Links, limits and units as in the crate's root; bounds (bone, border, movement limit) are not modelled: push in soft tissue.
 //! Cost: one heap operation a candidate. Storage is dense and made for speed, so that comparisons of time are fair.
 
+mod thesis;
+
+pub use thesis::{Deformed, Mapped, Thesis};
+
 use crate::{
     Tissue,
     mail::{Motion, Pin},

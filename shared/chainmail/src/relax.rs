@@ -6,7 +6,7 @@
 //! its bound; the sum of squared link strains falls with k². Bone and border stay at 0.
 //!
 //! A uniform decay knows nothing of stiffness or of a tool that lies against the tissue: it is for the time when no tool
-//! touches. Units: mm, along the grid's axes. Cost: one pass over the loaded bricks that are not at rest.
+//! touches, and for starting again from rest; `relaxation` knows both. Units: mm, along the grid's axes. Cost: one pass over the loaded bricks that are not at rest.
 
 use crate::{ChainMail, ChangedRegion, mail::spans};
 

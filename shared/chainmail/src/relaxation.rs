@@ -23,7 +23,7 @@
 
 use crate::{
     ChainMail, ChangedRegion,
-    brick::DisplacementBrick,
+    brick::{DisplacementBrick, ELEMENTS},
     links::{CUT, Metric, Rules, SLENDER},
     push::SPARE_COPIES,
     state::{Elements, Model},
@@ -296,7 +296,7 @@ impl Sweep<'_> {
             return None;
         }
         let mut tile = self.gather(elements, brick.id);
-        let bound = &elements.limits(slot).bound;
+        let limits = elements.limits(slot);
         let first = elements.layout().first_voxel(brick.id);
         let tools: Vec<&Capsule> = self.tools.iter().filter(|t| self.may_touch(t, brick, first)).collect();
         let held = |n: usize| {
@@ -307,7 +307,8 @@ impl Sweep<'_> {
             })
         };
         let mut moved = false;
-        for (n, &bound) in bound.iter().enumerate() {
+        for n in 0..ELEMENTS {
+            let bound = limits.bound_of(n);
             let voxel = [n % EDGE, n / EDGE % EDGE, n / (EDGE * EDGE)];
             let t = at(voxel[0] + 1, voxel[1] + 1, voxel[2] + 1);
             if (0..3).all(|c| tile.u[c][t] == tile.r[c][t]) {

@@ -27,7 +27,7 @@ impl ChainMail {
                 self.before.keep(&self.elements, slot, c);
                 let brick = self.elements.brick_mut(slot);
                 let limits = brick.limits.as_deref().expect("loaded above");
-                for (u, &bound) in brick.displacement.u[c].iter_mut().zip(&limits.bound) {
+                for (u, &bound) in brick.displacement.u[c].iter_mut().zip(limits.bound.iter().flat_map(|b| b.iter())) {
                     *u = u.clamp(-bound, bound) + 0.0;
                 }
             }

@@ -4,10 +4,11 @@ use crate::{
     brick::{DisplacementBrick, ELEMENTS},
     graph::step,
     links::{CUT, LinkModel, SLENDER},
-    tissue::Tissue,
+    tissue::{ElementLimits, Tissue},
 };
 use bytemuck::Zeroable;
 use maille_volume::{Brick, BrickId, BrickLayout, BrickSource, brick::EDGE};
+use std::sync::Arc;
 
 /// No slot.
 const NONE: u32 = u32::MAX;
@@ -19,8 +20,8 @@ const BEYOND: f32 = f32::MAX;
 pub struct LimitsBrick {
     /// offset o; infinite in a void and where an element was removed
     pub offset: [f32; ELEMENTS],
-    /// bound on |u_c| [mm]: 0 on bone, the movement limit, and the link to the virtual elements at the border
-    pub bound: [f32; ELEMENTS],
+    /// bound on |u_c| [mm]: 0 on bone, the movement limit, and the link to the virtual elements at the border; `None`: nowhere one
+    pub bound: Option<Box<[f32; ELEMENTS]>>,
     /// cuts and slenderness, where there are any
     pub flags: Option<Box<[u8; ELEMENTS]>>,
     /// smallest bound
@@ -32,6 +33,24 @@ pub struct LimitsBrick {
 }
 
 impl LimitsBrick {
+    /// Of a brick beyond the volume.
+    fn beyond() -> Box<Self> {
+        Box::new(Self {
+            offset: [BEYOND; ELEMENTS],
+            bound: None,
+            flags: None,
+            least_bound: f32::INFINITY,
+            least_own_bound: f32::INFINITY,
+            uniform: None,
+        })
+    }
+
+    /// Bound on |u_c| of an element [mm].
+    #[inline(always)]
+    pub fn bound_of(&self, n: usize) -> f32 {
+        self.bound.as_ref().map_or(f32::INFINITY, |b| b[n])
+    }
+
     /// Offset and flags of an element.
     #[inline(always)]
     pub fn of(&self, n: usize) -> (f32, u8) {
@@ -52,7 +71,7 @@ pub struct ElementBrick {
     /// displacement to which elements return, once there is one
     pub plastic: Option<Box<DisplacementBrick>>,
     /// limits, once something moved here
-    pub limits: Option<Box<LimitsBrick>>,
+    pub limits: Option<Arc<LimitsBrick>>,
 }
 
 impl ElementBrick {
@@ -86,12 +105,14 @@ pub struct Elements {
     /// slot of each brick of the volume
     slots: Vec<u32>,
     bricks: Vec<Box<ElementBrick>>,
+    /// limits of bricks in which all elements are alike: one copy serves them all
+    alike: Option<Arc<LimitsBrick>>,
 }
 
 impl Elements {
     /// Nothing loaded.
     pub fn new(layout: BrickLayout, spacing: [f32; 3]) -> Self {
-        Self { slots: vec![NONE; layout.count()], layout, spacing, bricks: Vec::new() }
+        Self { slots: vec![NONE; layout.count()], layout, spacing, bricks: Vec::new(), alike: None }
     }
 
     pub fn layout(&self) -> &BrickLayout {
@@ -132,7 +153,8 @@ impl Elements {
     pub fn load_with_limits<S: BrickSource + ?Sized>(&mut self, rest: &S, model: &Model, id: BrickId) -> usize {
         let slot = self.load(id);
         if self.bricks[slot].limits.is_none() {
-            self.bricks[slot].limits = Some(self.limits_of(rest, model, id));
+            let limits = self.alike(rest, model, id).unwrap_or_else(|| self.limits_of(rest, model, id));
+            self.bricks[slot].limits = Some(limits);
         }
         slot
     }
@@ -171,6 +193,7 @@ impl Elements {
 
     /// Forgets all limits, for other parameters.
     pub fn drop_limits(&mut self) {
+        self.alike = None;
         for brick in &mut self.bricks {
             brick.limits = None;
         }
@@ -260,23 +283,45 @@ impl Elements {
         (offset, bound, own)
     }
 
-    fn limits_of<S: BrickSource + ?Sized>(&self, rest: &S, model: &Model, id: BrickId) -> Box<LimitsBrick> {
-        let mut out = Box::new(LimitsBrick {
-            offset: [BEYOND; ELEMENTS],
-            bound: [f32::INFINITY; ELEMENTS],
-            flags: None,
-            least_bound: f32::INFINITY,
-            least_own_bound: f32::INFINITY,
-            uniform: None,
-        });
+    /// Limits of a brick inside the volume whose values all mean the same; `None`: it is no such brick.
+    fn alike<S: BrickSource + ?Sized>(&mut self, rest: &S, model: &Model, id: BrickId) -> Option<Arc<LimitsBrick>> {
+        let first = self.layout.first_voxel(id);
+        let border = (0..3).any(|c| first[c] == 0 || first[c] + EDGE >= self.layout.size[c]);
+        if border || model.links.slender.is_some() || self.is_cut_around(id) {
+            return None;
+        }
+        // limits fall as values rise: where those of the ends of the range agree, all do
+        let rescale = rest.info().rescale;
+        let [ElementLimits { offset, bound }, most] = rest.brick(id).range().map(|v| model.tissue.limits(rescale.value(f64::from(v))));
+        if (ElementLimits { offset, bound }) != most {
+            return None;
+        }
+        let bound = if offset.is_infinite() && bound > 0.0 { f32::INFINITY } else { bound };
+        if let Some(alike) = &self.alike
+            && alike.uniform == Some(offset)
+            && alike.least_bound == bound
+        {
+            return Some(alike.clone());
+        }
+        let mut limits = LimitsBrick::beyond();
+        limits.offset.fill(offset);
+        limits.bound = bound.is_finite().then(|| Box::new([bound; ELEMENTS]));
+        (limits.least_bound, limits.least_own_bound, limits.uniform) = (bound, bound, Some(offset));
+        let limits: Arc<LimitsBrick> = Arc::from(limits);
+        self.alike = Some(limits.clone());
+        Some(limits)
+    }
+
+    fn limits_of<S: BrickSource + ?Sized>(&self, rest: &S, model: &Model, id: BrickId) -> Arc<LimitsBrick> {
+        let mut out = LimitsBrick::beyond();
         let layout = &self.layout;
         let (first, brick, rescale) = (layout.first_voxel(id), rest.brick(id), rest.info().rescale);
         let size: [usize; 3] = std::array::from_fn(|c| EDGE.min(layout.size[c] - first[c]));
         let (mut least, mut most) = (f32::INFINITY, 0.0f32);
+        let cut = self.is_cut_around(id);
         // values repeat: what one was found to be is kept for the next
         let mut last = None;
         let border = (0..3).any(|c| first[c] == 0 || first[c] + EDGE >= layout.size[c]);
-        let cut = self.is_cut_around(id);
         for k in 0..size[2] {
             for j in 0..size[1] {
                 let (from, to) = (Brick::offset(0, j as isize, k as isize), DisplacementBrick::offset(0, j, k));
@@ -295,7 +340,10 @@ impl Elements {
                             limits
                         }
                     };
-                    (out.offset[to + i], out.bound[to + i]) = (limits.0, limits.1);
+                    out.offset[to + i] = limits.0;
+                    if limits.1 < f32::INFINITY {
+                        out.bound.get_or_insert_with(|| Box::new([f32::INFINITY; ELEMENTS]))[to + i] = limits.1;
+                    }
                     out.least_bound = out.least_bound.min(limits.1);
                     out.least_own_bound = out.least_own_bound.min(limits.2);
                     (least, most) = (least.min(limits.0), most.max(limits.0));
@@ -313,7 +361,7 @@ impl Elements {
             flags.iter_mut().zip(cuts).for_each(|(f, c)| *f |= c & 7);
         }
         out.uniform = (least == most && out.flags.is_none() && !cut).then_some(least);
-        out
+        Arc::from(out)
     }
 
     /// Whether a brick or one of its neighbours has cuts.

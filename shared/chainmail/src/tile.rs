@@ -323,10 +323,10 @@ impl Tile {
         }
         // nothing rises above the largest value that is there
         self.bounded = self.largest() > limits_of.least_bound;
-        if self.bounded {
+        if let (true, Some(bound)) = (self.bounded, limits_of.bound.as_deref()) {
             for k in 0..EDGE {
                 for j in 0..EDGE {
-                    self.bound[k][0][j] = row(&limits_of.bound, j, k);
+                    self.bound[k][0][j] = row(bound, j, k);
                 }
                 self.bound[k][1] = transposed(&self.bound[k][0]);
             }

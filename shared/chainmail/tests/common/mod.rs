@@ -169,17 +169,18 @@ pub mod graph {
     use super::{ChainMail, voxels};
     use maille_volume::{BrickSource, BrickedVolume};
 
-    /// Each link of component c: (p, q, how far u(p) may exceed u(q), and the other way).
-    pub fn links(rest: &BrickedVolume, mail: &ChainMail, c: usize) -> Vec<(usize, usize, f32, f32)> {
+    /// Each link by component: (p, q, how far u(p) may exceed u(q), and the other way).
+    pub fn all_links(rest: &BrickedVolume, mail: &ChainMail) -> [Vec<(usize, usize, f32, f32)>; 3] {
         let (size, grid) = (mail.layout().size, &rest.info().grid);
-        let mut out = Vec::new();
+        let mut out: [Vec<_>; 3] = Default::default();
         for p in voxels(size) {
             for axis in 0..3 {
                 let mut q = p;
                 q[axis] += 1;
                 if q[axis] < size[axis] {
-                    let [over, under] = mail.directed_link(rest, p, axis, c);
-                    out.push((grid.offset(p[0], p[1], p[2]), grid.offset(q[0], q[1], q[2]), over, under));
+                    for (out, [over, under]) in out.iter_mut().zip(mail.directed_links(rest, p, axis)) {
+                        out.push((grid.offset(p[0], p[1], p[2]), grid.offset(q[0], q[1], q[2]), over, under));
+                    }
                 }
             }
         }
@@ -190,9 +191,9 @@ pub mod graph {
     pub fn worst(rest: &BrickedVolume, mail: &ChainMail) -> f64 {
         let mut worst = 0.0f64;
         let u: Vec<[f32; 3]> = voxels(mail.layout().size).map(|v| mail.displacement(v)).collect();
-        for c in 0..3 {
+        for (c, links) in all_links(rest, mail).into_iter().enumerate() {
             let plane: Vec<f64> = u.iter().map(|u| f64::from(u[c])).collect();
-            for (p, q, over, under) in links(rest, mail, c) {
+            for (p, q, over, under) in links {
                 let difference = plane[p] - plane[q];
                 worst = worst.max(difference - 1.001 * f64::from(over)).max(-difference - 1.001 * f64::from(under));
             }
@@ -207,8 +208,7 @@ pub mod graph {
     /// Largest u(p) − u(q) − d(p, q) over all paths, and largest |u(p)| − M(p), by Bellman–Ford.
     pub fn largest_excess(rest: &BrickedVolume, mail: &ChainMail) -> [f64; 2] {
         let mut most = [0.0f64; 2];
-        for c in 0..3 {
-            let links = links(rest, mail, c);
+        for (c, links) in all_links(rest, mail).into_iter().enumerate() {
             let start: Vec<f64> = voxels(mail.layout().size).map(|v| f64::from(mail.displacement(v)[c])).collect();
             let settle = |mut u: Vec<f64>| loop {
                 let before = u.clone();
