@@ -6,7 +6,7 @@
 
 use crate::{
     camera::Camera,
-    settings::{Light, Mode, Settings, Shading},
+    settings::{Adaptive, Light, Mode, Settings, Shading},
     transfer::Table,
 };
 use maille_volume::VolumeInfo;
@@ -30,17 +30,27 @@ pub struct Frame {
     /// pixel column x ↦ x · scale[0] + shift[0] in units of `right`; rows likewise
     pub scale: [f32; 2],
     pub shift: [f32; 2],
+    /// width over height
+    pub aspect: f32,
+    /// barrel distortion, 0 for none (see [`crate::render::Extras`])
+    pub barrel: f32,
     /// distance between samples [mm]
     pub step: f32,
     /// light left at which a ray stops
     pub opaque: f32,
+    /// pieces of ray by weight, or (with limits that nothing meets) all of one step
+    pub adaptive: Adaptive,
     /// index of the last voxel
     pub last: [f32; 3],
+    /// how far beyond the volume rays begin and end [index]: what a warp may bring out of it
+    pub margin: [f32; 3],
     /// lower corner of the last trilinear cell
     pub last_cell: [i32; 3],
     /// stored value ↦ what the mode looks at: table index (volume) or HU
     pub value_scale: f32,
     pub value_offset: f32,
+    /// the surface's value, in what the mode looks at
+    pub threshold: f32,
     pub mode: Mode,
     pub table: Table,
     pub shading: Option<Shading>,
@@ -53,24 +63,35 @@ pub struct Frame {
     pub background: [f32; 3],
 }
 
-/// One ray: where its samples are.
+/// One ray: the part of it in the volume.
 #[derive(Clone, Copy, Debug)]
 pub struct Ray {
-    /// first sample, continuous index
+    /// where it enters, continuous index
     pub origin: [f32; 3],
-    /// index steps from sample to sample
+    /// index steps for one step
     pub delta: [f32; 3],
     /// unit direction in the grid's axes
     pub direction: [f32; 3],
-    /// number of samples
-    pub samples: f32,
-    /// distance from the eye to the first sample [mm]
+    /// steps from where it enters to where it leaves; negative when it misses
+    pub length: f32,
+    /// distance from the eye to where it enters [mm]
     pub start: f32,
 }
 
+/// Pieces of one step whatever they weigh.
+const EVEN: Adaptive =
+    Adaptive { heaviest: f32::INFINITY, lightest: -1.0, shortest: 1.0, longest: 1.0, gentle_opacity: 0.0, shade_from: 0.0 };
+
 impl Frame {
     /// The constants; camera and settings must have been checked.
-    pub fn new(info: &VolumeInfo, camera: &Camera, settings: &Settings, width: usize, height: usize) -> Self {
+    pub fn new(
+        info: &VolumeInfo,
+        camera: &Camera,
+        settings: &Settings,
+        [width, height]: [usize; 2],
+        barrel: f32,
+        margin: [f32; 3],
+    ) -> Self {
         let grid = &info.grid;
         // patient axes → the grid's axes; for orthonormal direction cosines this is their transpose
         let axes: Matrix3<f64> = grid.direction_matrix().try_inverse().unwrap_or_else(Matrix3::identity);
@@ -80,9 +101,14 @@ impl Frame {
         let step = settings.step.millimetres(info);
         let table = Table::new(&settings.transfer, step);
         let (mut value_scale, mut value_offset) = (info.rescale.slope, info.rescale.intercept);
-        if settings.mode == Mode::Volume {
+        let mut threshold = match settings.mode {
+            Mode::Isosurface { threshold_hu, .. } | Mode::Both { threshold_hu, .. } => threshold_hu,
+            _ => 0.0,
+        };
+        if matches!(settings.mode, Mode::Volume | Mode::Both { .. }) {
             // + 0.5: the nearest entry by truncation
             (value_scale, value_offset) = (value_scale * table.scale, value_offset * table.scale + table.offset + 0.5);
+            threshold = threshold * table.scale + table.offset + 0.5;
         }
         let light = settings.shading.map_or(Light::Headlight, |s| s.light);
         let falloff = match light {
@@ -98,7 +124,15 @@ impl Frame {
             per_mm: grid.spacing.map(|s| (1.0 / s) as f32),
             scale: [2.0 / width as f32, 2.0 / height as f32],
             shift: [1.0 / width as f32 - 1.0, 1.0 / height as f32 - 1.0],
+            aspect: aspect as f32,
+            barrel,
+            margin,
             step: step as f32,
+            threshold: threshold as f32,
+            adaptive: match settings.mode {
+                Mode::Volume | Mode::Both { .. } => settings.adaptive.unwrap_or(EVEN),
+                _ => EVEN,
+            },
             opaque: (1.0 - settings.opacity_end) as f32,
             last: grid.size.map(|s| (s - 1) as f32),
             last_cell: grid.size.map(|s| s.saturating_sub(2) as i32),
@@ -114,10 +148,12 @@ impl Frame {
         }
     }
 
-    /// The ray through the centre of a pixel; it has no samples where it misses the volume.
+    /// The ray through the centre of a pixel; its length is negative where it misses the volume.
     pub fn ray(&self, x: usize, y: usize) -> Ray {
         let u = x as f32 * self.scale[0] + self.shift[0];
         let v = y as f32 * self.scale[1] + self.shift[1];
+        let stretch = (1.0 + self.barrel * (u * u * self.aspect * self.aspect + v * v)) / (1.0 + self.barrel);
+        let (u, v) = (u * stretch, v * stretch);
         let mut direction: [f32; 3] = std::array::from_fn(|c| self.forward[c] + u * self.right[c] + v * self.down[c]);
         let inverse_length = 1.0 / direction.iter().map(|d| d * d).sum::<f32>().sqrt();
         direction = direction.map(|d| d * inverse_length);
@@ -128,17 +164,17 @@ impl Frame {
             if per_mm[c].abs() < TINY {
                 per_mm[c] = TINY;
             }
-            let (a, b) = (-self.eye[c] / per_mm[c], (self.last[c] - self.eye[c]) / per_mm[c]);
+            let (low, high) = (-self.margin[c] - self.eye[c], self.last[c] + self.margin[c] - self.eye[c]);
+            let (a, b) = (low / per_mm[c], high / per_mm[c]);
             enter = enter.max(a.min(b));
             leave = leave.min(a.max(b));
         }
-        let start = enter + 0.5 * self.step;
         Ray {
-            origin: std::array::from_fn(|c| self.eye[c] + start * per_mm[c]),
+            origin: std::array::from_fn(|c| self.eye[c] + enter * per_mm[c]),
             delta: per_mm.map(|d| d * self.step),
             direction,
-            samples: ((leave - start) / self.step).floor() + 1.0,
-            start,
+            length: (leave - enter) / self.step,
+            start: enter,
         }
     }
 }

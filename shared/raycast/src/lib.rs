@@ -7,18 +7,19 @@
 //! Units and frames: camera and planes in LPS millimetres; values in HU; opacity α over 1 mm, corrected for the step by
 //! 1 − (1 − α)^step; colours linear in 0…1, written as bytes without gamma (as VTK does, so that pictures compare).
 //!
-//! Conventions: the volume is the box of voxel centres (0 … n−1 on each axis). Samples lie on a grid of each ray's own,
-//! half a step behind its entry into that box, and skipping only ever jumps along this grid: the picture does not depend on
-//! it. Gradients are central differences at the eight voxels around the sample, interpolated (no gradient volume exists).
+//! Conventions: the volume is the box of voxel centres (0 … n−1 on each axis). A ray is cut into pieces from its entry into that
+//! box on, each with a sample in its middle, one step long or as [`Adaptive`] has them; skipping goes on as if by single steps,
+//! so that the picture does not depend on it. Gradients are central differences at the eight voxels around the sample, interpolated (no gradient volume exists).
 //!
 //! Invariants: no clock, no file, no logging; no voxel is copied; nothing is allocated per ray. `unsafe` lives in
-//! [`packet`] alone (CPU features found at run time, loads without bounds checks), each with its reason.
+//! the packets' files (`lanes`, `packet`, `walk`: CPU features found at run time, loads without bounds checks), with its reasons.
 
 #![deny(unsafe_code)]
 
 pub mod camera;
 mod frame;
-#[cfg(target_arch = "x86_64")]
+pub mod labels;
+mod lanes;
 mod packet;
 pub mod picture;
 pub mod render;
@@ -29,11 +30,15 @@ pub mod skip;
 #[cfg(test)]
 mod tests;
 pub mod transfer;
+mod walk;
+pub mod warp;
 
 pub use camera::Camera;
+pub use labels::Labels;
 pub use picture::Picture;
-pub use render::{Kernel, RenderError, render, render_with};
+pub use render::{Extras, Kernel, RenderError, render, render_extra, render_with};
 pub use section::{Plane, Section, section};
-pub use settings::{Light, Mode, Settings, Shading, Step};
+pub use settings::{Adaptive, Light, Mode, Settings, Shading, Step};
 pub use skip::{Skip, SkipUpdate};
 pub use transfer::{Preset, Transfer, TransferError};
+pub use warp::{Motion, Warp, WarpError, WarpOptions, WarpReport};

@@ -3,10 +3,13 @@
 use crate::{
     camera::Camera,
     frame::Frame,
+    labels::Labels,
+    packet::{self, Width},
     picture::Picture,
     scalar::{Caster, Seen},
     settings::{Light, Mode, Settings},
     skip::Skip,
+    warp::Warp,
 };
 use maille_volume::BrickSource;
 use rayon::prelude::*;
@@ -39,6 +42,9 @@ pub enum RenderError {
     /// [`Skip::update`] was not called with these settings and this source
     #[error("the map of empty space belongs to other settings or another volume: update it first")]
     StaleSkip,
+    /// a warp or labels made for another volume, or a warp that was never updated
+    #[error("{0}")]
+    Extras(String),
 }
 
 /// Which code walks the rays.
@@ -47,10 +53,39 @@ pub enum Kernel {
     /// the fastest that this processor runs
     #[default]
     Fastest,
-    /// one ray at a time: the reference
+    /// packets in plain Rust
+    Portable,
+    /// packets of eight rays; [`Kernel::Portable`] where the processor has no AVX2
+    Avx2,
+    /// packets of sixteen rays; [`Kernel::Portable`] where the processor has no AVX-512
+    Avx512,
+    /// one ray at a time: the reference, without warp and labels
     Scalar,
     /// one ray at a time, looking at every sample
     ScalarWithoutSkipping,
+}
+
+/// What a picture may have beside volume, camera and settings.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Extras<'a> {
+    /// which code walks the rays
+    pub kernel: Kernel,
+    /// a displacement field that rays go through
+    pub warp: Option<&'a Warp>,
+    /// colours of organs (volume modes)
+    pub labels: Option<&'a Labels>,
+    /// barrel distortion k of the lens, at least 0: the ray of a point at radius r (1 at the upper edge) looks along r·(1 + k r²)/(1 + k),
+    /// so that the field of view holds at the upper edge and what is further out shrinks
+    pub barrel: f64,
+}
+
+/// What kernels read.
+pub(crate) struct Stage<'a, S: ?Sized> {
+    pub frame: &'a Frame,
+    pub source: &'a S,
+    pub skip: &'a Skip,
+    pub warp: Option<&'a Warp>,
+    pub labels: Option<&'a Labels>,
 }
 
 /// Renders a picture on the current rayon pool.
@@ -64,7 +99,7 @@ pub fn render(
     settings: &Settings,
     picture: &mut Picture,
 ) -> Result<(), RenderError> {
-    render_with(Kernel::Fastest, source, skip, camera, settings, picture)
+    render_extra(&Extras::default(), source, skip, camera, settings, picture)
 }
 
 /// [`render`] with a kernel of one's choice; for tests and measurements.
@@ -79,29 +114,74 @@ pub fn render_with<S: BrickSource + ?Sized>(
     settings: &Settings,
     picture: &mut Picture,
 ) -> Result<(), RenderError> {
+    render_extra(&Extras { kernel, ..Extras::default() }, source, skip, camera, settings, picture)
+}
+
+/// [`render`] with everything that a picture may have.
+///
+/// # Errors
+/// [`RenderError`]; the picture is then untouched.
+pub fn render_extra<S: BrickSource + ?Sized>(
+    extras: &Extras<'_>,
+    source: &S,
+    skip: &Skip,
+    camera: &Camera,
+    settings: &Settings,
+    picture: &mut Picture,
+) -> Result<(), RenderError> {
     check(source, skip, camera, settings, picture)?;
+    check_extras(extras, source)?;
     let (width, height) = (picture.width, picture.height);
-    let frame = Frame::new(source.info(), camera, settings, width, height);
-    let caster = Caster { frame: &frame, source, skip: (kernel != Kernel::ScalarWithoutSkipping).then_some(skip) };
-    let vector = kernel == Kernel::Fastest && packets_run_here();
+    let margin = extras.warp.map_or([0.0; 3], Warp::margin);
+    let frame = Frame::new(source.info(), camera, settings, [width, height], extras.barrel as f32, margin);
+    let caster = Caster { frame: &frame, source, skip, jumps: extras.kernel != Kernel::ScalarWithoutSkipping };
+    let stage = Stage { frame: &frame, source, skip, warp: extras.warp, labels: extras.labels };
+    let lanes = match extras.kernel {
+        Kernel::Fastest => Some(packet::widest()),
+        Kernel::Portable => Some(Width::Portable),
+        Kernel::Avx2 => Some(Width::Avx2),
+        Kernel::Avx512 => Some(Width::Avx512),
+        Kernel::Scalar | Kernel::ScalarWithoutSkipping => None,
+    };
     let band = |n: usize, rgb: &mut [u8], mut depth: Option<&mut [f32]>| {
         let rows = rgb.len() / (3 * width);
         for x0 in (0..width).step_by(TILE) {
             let columns = TILE.min(width - x0);
-            let put = |x: usize, y: usize, seen: Seen| {
+            let mut put = |x: usize, y: usize, seen: Seen| {
                 let at = (y - n * BAND) * width + x;
                 write_pixel(&frame, seen, &mut rgb[3 * at..3 * at + 3]);
                 if let Some(depth) = &mut depth {
                     depth[at] = seen.depth;
                 }
             };
-            cast_tile(&caster, skip, vector, [x0, n * BAND], [columns, rows], put);
+            match lanes {
+                Some(lanes) => packet::cast_tile(lanes, &stage, [x0, n * BAND], [columns, rows], put),
+                None => (n * BAND..n * BAND + rows).for_each(|y| (x0..x0 + columns).for_each(|x| put(x, y, caster.cast(x, y)))),
+            }
         }
     };
     let colors = picture.rgb.par_chunks_mut(BAND * 3 * width).enumerate().with_max_len(1);
     match &mut picture.depth {
         Some(depth) => colors.zip(depth.par_chunks_mut(BAND * width)).for_each(|((n, rgb), depth)| band(n, rgb, Some(depth))),
         None => colors.for_each(|(n, rgb)| band(n, rgb, None)),
+    }
+    Ok(())
+}
+
+fn check_extras<S: BrickSource + ?Sized>(extras: &Extras<'_>, source: &S) -> Result<(), RenderError> {
+    let fault = |text: &str| Err(RenderError::Extras(text.into()));
+    if !(extras.barrel >= 0.0 && extras.barrel.is_finite()) {
+        return fault("a barrel distortion must be 0 or more");
+    }
+    if extras.warp.is_some_and(|w| !w.suits(source.info())) {
+        return fault("the warp was made for another volume, or never updated");
+    }
+    if extras.labels.is_some_and(|l| l.size() != source.info().grid.size) {
+        return fault("the labels are not on the volume's grid");
+    }
+    let reference = matches!(extras.kernel, Kernel::Scalar | Kernel::ScalarWithoutSkipping);
+    if reference && (extras.warp.is_some() || extras.labels.is_some()) {
+        return fault("the scalar kernel knows neither warp nor labels");
     }
     Ok(())
 }
@@ -131,10 +211,16 @@ fn check<S: BrickSource + ?Sized>(
     if !(0.5..=1.0).contains(&settings.opacity_end) {
         return Err(RenderError::Settings(format!("rays that end at an opacity of {}: it must be 0.5 to 1", settings.opacity_end)));
     }
-    if let Mode::Isosurface { threshold_hu: v, .. } | Mode::Xray { water_per_mm: v } = settings.mode
+    if let Mode::Isosurface { threshold_hu: v, .. } | Mode::Both { threshold_hu: v, .. } | Mode::Xray { water_per_mm: v } = settings.mode
         && !v.is_finite()
     {
         return Err(RenderError::Settings(format!("{v} is no threshold or attenuation")));
+    }
+    if let Some(a) = settings.adaptive {
+        let lengths = a.shortest >= 0.01 && a.shortest <= 1.0 && a.longest >= 1.0 && a.longest <= 64.0;
+        if !(lengths && a.heaviest > 0.0 && a.lightest <= a.heaviest && a.gentle_opacity.is_finite()) {
+            return Err(RenderError::Settings(format!("pieces of ray by {a:?}: limits out of order")));
+        }
     }
     if let Some(Light::AtEye { half_distance_mm: d }) = settings.shading.map(|s| s.light)
         && (d <= 0.0 || d.is_nan())
@@ -145,35 +231,6 @@ fn check<S: BrickSource + ?Sized>(
         return Err(RenderError::StaleSkip);
     }
     Ok(())
-}
-
-/// Casts the rays of a tile and hands each pixel on.
-fn cast_tile<S: BrickSource + ?Sized>(
-    caster: &Caster<'_, S>,
-    skip: &Skip,
-    vector: bool,
-    first: [usize; 2],
-    size: [usize; 2],
-    mut put: impl FnMut(usize, usize, Seen),
-) {
-    #[cfg(target_arch = "x86_64")]
-    if vector {
-        return crate::packet::cast_tile(caster.frame, caster.source, skip, first, size, put);
-    }
-    let _ = (skip, vector);
-    for y in first[1]..first[1] + size[1] {
-        for x in first[0]..first[0] + size[0] {
-            put(x, y, caster.cast(x, y));
-        }
-    }
-}
-
-/// Whether the packet kernel runs on this processor.
-fn packets_run_here() -> bool {
-    #[cfg(target_arch = "x86_64")]
-    return crate::packet::available();
-    #[cfg(not(target_arch = "x86_64"))]
-    false
 }
 
 #[inline]

@@ -1,13 +1,13 @@
-//! One ray at a time, in plain Rust: the reference of the packet kernel, and what runs where there is no AVX2.
+//! One ray at a time, in plain Rust: the reference of the packets.
 //!
-//! Volume: C ← C + T·α·c, T ← T·(1 − α), front to back. Isosurface: the first sample at or above the threshold, then
-//! regula falsi between it and the sample before. X-ray: Σ μ·step. Same sample grid, same skipping, same shading as
-//! [`packet`](crate::packet).
+//! Volume: C ← C + T·α·c, T ← T·(1 − α), front to back, over pieces of ray ([`Adaptive`](crate::Adaptive)). Isosurface: the first
+//! sample at or above the threshold, then regula falsi between it and one step before. X-ray: Σ μ·step. Same pieces, same
+//! skipping, same shading as [`walk`](crate::walk).
 
 use crate::{
     frame::{Frame, REFINEMENTS, Ray},
     settings::Mode,
-    skip::Skip,
+    skip::{GENTLE, Skip},
 };
 use maille_volume::{
     BrickSource,
@@ -29,8 +29,9 @@ pub struct Seen {
 pub struct Caster<'a, S: BrickSource + ?Sized> {
     pub frame: &'a Frame,
     pub source: &'a S,
-    /// none: every sample is looked at
-    pub skip: Option<&'a Skip>,
+    pub skip: &'a Skip,
+    /// whether empty space is jumped over; otherwise every sample in it is looked at
+    pub jumps: bool,
 }
 
 impl<S: BrickSource + ?Sized> Caster<'_, S> {
@@ -39,27 +40,66 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
         let f = self.frame;
         let ray = f.ray(x, y);
         let mut seen = Seen { color: [0.0; 3], transmittance: 1.0, depth: f32::INFINITY };
-        let mut attenuation = 0.0;
-        let mut k = 0.0f32;
-        while k < ray.samples {
-            let p = at(&ray, k);
-            if let Some(jump) = self.jump(&ray, p) {
-                k += jump;
+        let (mut attenuation, mut shaded) = (0.0, None);
+        // the piece of ray that comes next: its beginning and length [steps]
+        let (mut from, mut long) = (0.0f32, 1.0f32);
+        loop {
+            let q = from + 0.5 * long;
+            if q > ray.length || ray.length.is_nan() || ray.length <= 0.5 {
+                break;
+            }
+            let p = at(&ray, q);
+            let (distances, counts) = self.skip.distances();
+            let cell: [usize; 3] = std::array::from_fn(|c| self.cell_of(p, c) / CELL);
+            let state = distances[(cell[2] * counts[1] + cell[1]) * counts[0] + cell[0]];
+            let value = self.value(p) * f.value_scale + f.value_offset;
+            if state != 0 && state != GENTLE {
+                debug_assert!(f.mode != Mode::Volume || self.entry(value)[3] == 0.0, "something to be seen in an empty cell");
+                // as if the ray went on by one step at a time
+                let behind = from + long.max(1.0);
+                let out = if self.jumps { way_out(&ray, p, cell, state) } else { 0.0 };
+                (from, long, shaded) = (behind - 1.0 + (q + out - (1e-3 - 0.5) - behind).ceil().max(1.0), 1.0, None);
                 continue;
             }
-            let value = self.value(p) * f.value_scale + f.value_offset;
+            if let Mode::Isosurface { color, .. } | Mode::Both { color, .. } = f.mode
+                && value >= f.threshold
+            {
+                let cut = q < 0.75;
+                let q = if cut { q } else { self.refine(&ray, q, value) };
+                let (diffuse, specular) = if cut { self.cut() } else { self.shade(&ray, at(&ray, q), q) };
+                for (out, c) in seen.color.iter_mut().zip(color) {
+                    *out += seen.transmittance * (c * diffuse + specular);
+                }
+                if seen.transmittance > 0.5 {
+                    seen.depth = ray.start + q * f.step;
+                }
+                seen.transmittance = 0.0;
+                break;
+            }
             match f.mode {
-                Mode::Volume => {
-                    let [r, g, b, alpha] = f.table.entries[(value.max(0.0) as usize).min(f.table.entries.len() - 1)];
-                    if alpha > 0.0 {
-                        let (diffuse, specular) = self.shade(&ray, p, k);
-                        let weight = seen.transmittance * alpha;
+                Mode::Volume | Mode::Both { .. } => {
+                    let a = &f.adaptive;
+                    let [r, g, b, through] = self.entry(value);
+                    let weight = seen.transmittance * (1.0 - (through * long).exp2());
+                    if weight > a.heaviest && long > a.shortest {
+                        long *= 0.5;
+                        continue;
+                    }
+                    from += long;
+                    let longest = if state == GENTLE { a.longest } else { 1.0 };
+                    long = if weight < a.lightest { 2.0 * long } else { long }.min(longest);
+                    if weight > 0.0 {
+                        let (diffuse, specular) = match shaded {
+                            Some(last) if weight < a.shade_from => last,
+                            _ => self.shade(&ray, p, q),
+                        };
+                        shaded = Some((diffuse, specular));
                         for (out, c) in seen.color.iter_mut().zip([r, g, b]) {
                             *out += weight * (c * diffuse + specular);
                         }
                         let left = seen.transmittance - weight;
                         if seen.transmittance >= 0.5 && left < 0.5 {
-                            seen.depth = ray.start + k * f.step;
+                            seen.depth = ray.start + q * f.step;
                         }
                         seen.transmittance = left;
                         if left < f.opaque {
@@ -70,17 +110,12 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
                         }
                     }
                 }
-                Mode::Isosurface { threshold_hu, color } => {
-                    let threshold = threshold_hu as f32;
-                    if value >= threshold {
-                        let k = if k == 0.0 { k } else { self.refine(&ray, k, value, threshold) };
-                        let (diffuse, specular) = if k == 0.0 { self.cut() } else { self.shade(&ray, at(&ray, k), k) };
-                        return Seen { color: color.map(|c| c * diffuse + specular), transmittance: 0.0, depth: ray.start + k * f.step };
-                    }
+                Mode::Isosurface { .. } => from += 1.0,
+                Mode::Xray { water_per_mm } => {
+                    attenuation += water_per_mm as f32 * f.step * (1.0 + value * 1e-3).max(0.0);
+                    from += 1.0;
                 }
-                Mode::Xray { water_per_mm } => attenuation += water_per_mm as f32 * f.step * (1.0 + value * 1e-3).max(0.0),
             }
-            k += 1.0;
         }
         if matches!(f.mode, Mode::Xray { .. }) {
             seen.transmittance = (-attenuation).exp();
@@ -89,23 +124,10 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
         seen
     }
 
-    /// Samples to jump when the cell around p is empty: to the first one outside the empty box around it.
-    #[inline]
-    fn jump(&self, ray: &Ray, p: [f32; 3]) -> Option<f32> {
-        let (distances, counts) = self.skip?.distances();
-        let cell: [usize; 3] = std::array::from_fn(|c| self.cell_of(p, c) / CELL);
-        let d = distances[(cell[2] * counts[1] + cell[1]) * counts[0] + cell[0]];
-        if d == 0 {
-            return None;
-        }
-        let mut jump = f32::INFINITY;
-        for c in 0..3 {
-            let side = if ray.delta[c] > 0.0 { i32::from(d) } else { 1 - i32::from(d) };
-            let wall = (CELL as i32 * (cell[c] as i32 + side)) as f32;
-            jump = jump.min((wall - p[c]) / ray.delta[c]);
-        }
-        // a hair less: a sample on the wall, moved across it by rounding, is looked at
-        Some((jump - 1e-3).ceil().max(1.0))
+    /// Colour and log₂ of what a step lets through.
+    fn entry(&self, value: f32) -> [f32; 4] {
+        let entries = &self.frame.table.entries;
+        entries[(value.max(0.0) as usize).min(entries.len() - 1)]
     }
 
     /// Lower corner of the trilinear cell around p, on one axis.
@@ -146,7 +168,7 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
     }
 
     /// Factors of colour and highlight at a sample.
-    fn shade(&self, ray: &Ray, p: [f32; 3], k: f32) -> (f32, f32) {
+    fn shade(&self, ray: &Ray, p: [f32; 3], q: f32) -> (f32, f32) {
         let f = self.frame;
         let Some(shading) = f.shading else { return (1.0, 0.0) };
         let g = self.gradient(p);
@@ -154,7 +176,7 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
         let light = if f.at_eye { ray.direction } else { f.light };
         let dot = (g[0] * light[0] + g[1] * light[1] + g[2] * light[2]).abs();
         let cosine = if square > ZERO_GRADIENT { (dot / square.sqrt()).min(1.0) } else { 0.0 };
-        let distance = ray.start + k * f.step;
+        let distance = ray.start + q * f.step;
         let strength = 1.0 / (1.0 + distance * distance * f.falloff);
         let highlight = if square > ZERO_GRADIENT { shading.specular * cosine.powi(shading.power as i32) } else { 0.0 };
         ((shading.ambient * shading.ambient_light + shading.diffuse * cosine) * strength, highlight * strength)
@@ -165,12 +187,12 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
         self.frame.shading.map_or((1.0, 0.0), |s| (s.ambient * s.ambient_light + s.diffuse, 0.0))
     }
 
-    /// Sample number, fractional, at which the threshold is crossed between k − 1 and k (Illinois regula falsi).
-    fn refine(&self, ray: &Ray, k: f32, value: f32, threshold: f32) -> f32 {
+    /// Where the threshold is crossed between q − 1 and q [steps] (Illinois regula falsi).
+    fn refine(&self, ray: &Ray, q: f32, value: f32) -> f32 {
         let f = self.frame;
-        let miss = |k: f32| self.value(at(ray, k)) * f.value_scale + f.value_offset - threshold;
-        let (mut a, mut b) = (k - 1.0, k);
-        let (mut at_a, mut at_b) = (miss(a).min(-1e-6), value - threshold);
+        let miss = |q: f32| self.value(at(ray, q)) * f.value_scale + f.value_offset - f.threshold;
+        let (mut a, mut b) = (q - 1.0, q);
+        let (mut at_a, mut at_b) = (miss(a).min(-1e-6), value - f.threshold);
         for _ in 0..REFINEMENTS {
             let middle = a + (b - a) * (at_a / (at_a - at_b));
             let v = miss(middle);
@@ -189,9 +211,22 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
 /// Squared gradient [(stored units/mm)²] below which there is no direction: far less than one unit of difference.
 pub const ZERO_GRADIENT: f32 = 1e-8;
 
+/// Position q steps from where the ray enters.
 #[inline]
-fn at(ray: &Ray, k: f32) -> [f32; 3] {
-    std::array::from_fn(|c| ray.delta[c].mul_add(k, ray.origin[c]))
+fn at(ray: &Ray, q: f32) -> [f32; 3] {
+    std::array::from_fn(|c| ray.delta[c].mul_add(q, ray.origin[c]))
+}
+
+/// Steps from p, in an empty cell at distance d, to where the box of empty cells around it ends.
+#[inline]
+fn way_out(ray: &Ray, p: [f32; 3], cell: [usize; 3], d: u8) -> f32 {
+    let mut least = f32::INFINITY;
+    for c in 0..3 {
+        let side = if ray.delta[c] > 0.0 { i32::from(d) } else { 1 - i32::from(d) };
+        let wall = (CELL as i32 * (cell[c] as i32 + side)) as f32;
+        least = least.min((wall - p[c]) / ray.delta[c]);
+    }
+    least
 }
 
 #[inline]

@@ -15,6 +15,13 @@ pub enum Mode {
         /// its colour
         color: [f32; 3],
     },
+    /// both: composition under the transfer function until the ray meets the surface at a value, which is opaque
+    Both {
+        /// value of the surface (HU); matter is at and above it
+        threshold_hu: f64,
+        /// its colour
+        color: [f32; 3],
+    },
     /// Beer–Lambert transmission, dense bright: 1 − exp(−∫ μ ds), μ = μ_water · max(0, 1 + HU/1000)
     Xray {
         /// attenuation of water [1/mm]; 0.02 is about that of 70 keV photons, less shows a thick body better
@@ -78,6 +85,37 @@ impl Step {
     }
 }
 
+/// Where along a ray samples are worth their time: a sample's weight in the pixel (light left × its opacity) decides.
+///
+/// A sample stands in the middle of the piece of ray that it speaks for, of length l steps. Too heavy a sample is thrown away
+/// and its piece halved; light ones let the next piece be twice as long, but past one step only from *gentle* cells, in which
+/// nothing is more opaque than a limit: so hardly anything thin and opaque is stepped over. The normal of a sample that hardly counts is that
+/// of the last sample which had one.
+///
+/// The defaults were found on a real head: at the error of evenly spaced samples one step apart (RMS against a tenth of the step)
+/// half as many samples.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Adaptive {
+    /// weight above which a piece is halved
+    pub heaviest: f32,
+    /// weight below which the next piece is twice as long
+    pub lightest: f32,
+    /// shortest piece [steps]
+    pub shortest: f32,
+    /// longest piece in gentle cells [steps]; elsewhere 1
+    pub longest: f32,
+    /// a cell is gentle when no value in it has this opacity over 1 mm
+    pub gentle_opacity: f64,
+    /// weight from which on a sample has a normal of its own
+    pub shade_from: f32,
+}
+
+impl Default for Adaptive {
+    fn default() -> Self {
+        Self { heaviest: 0.1, lightest: 0.05, shortest: 0.5, longest: 2.0, gentle_opacity: 0.1, shade_from: 0.002 }
+    }
+}
+
 /// Everything but camera and voxels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
@@ -89,12 +127,17 @@ pub struct Settings {
     pub shading: Option<Shading>,
     /// distance between samples
     pub step: Step,
+    /// pieces of ray by weight (volume and both); none: samples one step apart
+    pub adaptive: Option<Adaptive>,
     /// share of the light used up at which a ray ends (volume mode), 0.5 to 1; what is left is taken to look like what was
     /// seen so far, so the error is a small part of it
     pub opacity_end: f64,
     /// colour where nothing is
     pub background: [f32; 3],
 }
+
+/// Colour of surfaces when nobody says another.
+const BONE: [f32; 3] = [0.93, 0.86, 0.76];
 
 impl Default for Settings {
     /// A shaded CT, one voxel a step, on black.
@@ -107,12 +150,25 @@ impl Settings {
     /// Volume rendering of a transfer function, with its own shading.
     pub fn volume(transfer: Transfer) -> Self {
         let shading = Some(transfer.shading.unwrap_or_default());
-        Self { mode: Mode::Volume, transfer, shading, step: Step::Voxels(1.0), opacity_end: 0.985, background: [0.0; 3] }
+        Self {
+            mode: Mode::Volume,
+            transfer,
+            shading,
+            step: Step::Voxels(1.0),
+            adaptive: Some(Adaptive::default()),
+            opacity_end: 0.97,
+            background: [0.0; 3],
+        }
+    }
+
+    /// The transfer function and, opaque among it, the surface at a value in the colour of bone.
+    pub fn both(transfer: Transfer, threshold_hu: f64) -> Self {
+        Self { mode: Mode::Both { threshold_hu, color: BONE }, ..Self::volume(transfer) }
     }
 
     /// The surface at a value, in the colour of bone.
     pub fn isosurface(threshold_hu: f64) -> Self {
-        let mode = Mode::Isosurface { threshold_hu, color: [0.93, 0.86, 0.76] };
+        let mode = Mode::Isosurface { threshold_hu, color: BONE };
         let shading = Some(Shading { ambient_light: 1.0, diffuse: 0.8, specular: 0.1, ..Shading::default() });
         Self { mode, shading, ..Self::default() }
     }

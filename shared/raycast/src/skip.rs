@@ -19,6 +19,11 @@ use rayon::prelude::*;
 /// Largest distance held [cells]: a jump of 60 voxels. More would make updates wider and rays hardly faster.
 pub const REACH: u8 = 15;
 
+/// Beside a distance of 0: occupied, and nothing in the cell is very opaque.
+pub(crate) const GENTLE: u8 = 0x80;
+/// Kernels read four bytes at a cell.
+const PADDING: usize = 3;
+
 /// What [`Skip::update`] had to do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SkipUpdate {
@@ -34,12 +39,15 @@ pub struct Skip {
     layout: BrickLayout,
     /// cells along i, j, k: whole bricks
     counts: [usize; 3],
-    /// distance to the nearest occupied cell [cells], 0 where occupied, at most REACH; i fastest
+    /// distance to the nearest occupied cell [cells], at most REACH; 0 where occupied, with [`GENTLE`] beside it where nothing in
+    /// the cell is very opaque; i fastest, and PADDING bytes that nobody looks at
     distance: Vec<u8>,
     /// stamp of each brick when it was read
     stamps: Vec<u64>,
     /// values that can be seen: closed intervals of HU
     visible: Vec<[f64; 2]>,
+    /// values so opaque that rays go slowly: closed intervals of HU
+    harsh: Vec<[f64; 2]>,
     rescale: Rescale,
 }
 
@@ -50,6 +58,33 @@ pub(crate) fn visible(settings: &Settings) -> Vec<[f64; 2]> {
         // one part in a million below, for rounding in the kernels' f32
         Mode::Isosurface { threshold_hu, .. } => vec![[threshold_hu - 1e-6 * threshold_hu.abs().max(1000.0), f64::INFINITY]],
         Mode::Xray { .. } => vec![[-1000.0, f64::INFINITY]],
+        Mode::Both { threshold_hu, .. } => {
+            let mut all = settings.transfer.visible();
+            all.push([threshold_hu - 1e-6 * threshold_hu.abs().max(1000.0), f64::INFINITY]);
+            all
+        }
+    }
+}
+
+/// Closed intervals of HU through which pieces of ray are no longer than a step.
+fn harsh(settings: &Settings) -> Vec<[f64; 2]> {
+    match (settings.mode, settings.adaptive) {
+        (Mode::Volume, Some(adaptive)) => settings.transfer.as_opaque_as(adaptive.gentle_opacity),
+        (Mode::Both { threshold_hu, .. }, Some(adaptive)) => {
+            let mut all = settings.transfer.as_opaque_as(adaptive.gentle_opacity);
+            all.push([threshold_hu - 1e-6 * threshold_hu.abs().max(1000.0), f64::INFINITY]);
+            all
+        }
+        _ => vec![[f64::NEG_INFINITY, f64::INFINITY]],
+    }
+}
+
+/// What a cell is before distances are known: occupied (0, gentle or not) or not.
+fn state(occupied: bool, gentle: bool) -> u8 {
+    match (occupied, gentle) {
+        (false, _) => REACH,
+        (true, true) => GENTLE,
+        (true, false) => 0,
     }
 }
 
@@ -61,9 +96,10 @@ impl Skip {
         let mut skip = Self {
             layout,
             counts,
-            distance: vec![REACH; counts.iter().product()],
+            distance: vec![REACH; counts.iter().product::<usize>() + PADDING],
             stamps: vec![0; layout.count()],
             visible: visible(settings),
+            harsh: harsh(settings),
             rescale: source.info().rescale,
         };
         skip.rebuild(source);
@@ -72,13 +108,13 @@ impl Skip {
 
     /// Brings the map up to date with a source and settings; nothing changed costs one look at each brick's stamp.
     pub fn update(&mut self, source: &(impl BrickSource + ?Sized), settings: &Settings) -> SkipUpdate {
-        let visible = visible(settings);
+        let (visible, harsh) = (visible(settings), harsh(settings));
         if self.layout != *source.layout() {
             *self = Self::new(source, settings);
-            return SkipUpdate { bricks_read: self.stamps.len(), cells_changed: self.distance.len() };
+            return SkipUpdate { bricks_read: self.stamps.len(), cells_changed: self.distance.len() - PADDING };
         }
-        if self.visible != visible || self.rescale != source.info().rescale {
-            self.visible = visible;
+        if self.visible != visible || self.harsh != harsh || self.rescale != source.info().rescale {
+            (self.visible, self.harsh) = (visible, harsh);
             self.rescale = source.info().rescale;
             let cells_changed = self.rebuild(source);
             return SkipUpdate { bricks_read: self.stamps.len(), cells_changed };
@@ -92,15 +128,19 @@ impl Skip {
             }
             self.stamps[id as usize] = stamp;
             done.bricks_read += 1;
-            let occupied = self.occupied_cells(&source.brick(id).cells, id);
+            let states = self.states(&source.brick(id).cells, id);
             let first = self.layout.coordinates(id).map(|c| c * CELLS_EDGE);
-            for (n, &now) in occupied.iter().enumerate() {
+            for (n, &now) in states.iter().enumerate() {
                 let cell = [first[0] + n % CELLS_EDGE, first[1] + n / CELLS_EDGE % CELLS_EDGE, first[2] + n / (CELLS_EDGE * CELLS_EDGE)];
                 let at = self.offset(cell);
-                if now != (self.distance[at] == 0) {
+                let (was_occupied, is_occupied) = (self.distance[at] & !GENTLE == 0, now & !GENTLE == 0);
+                if is_occupied {
+                    self.distance[at] = now;
+                }
+                if is_occupied != was_occupied {
                     done.cells_changed += 1;
                     // an emptied cell must not be taken for occupied by the pass below
-                    self.distance[at] = if now { 0 } else { REACH };
+                    self.distance[at] = now;
                     for c in 0..3 {
                         low[c] = low[c].min(cell[c]);
                         high[c] = high[c].max(cell[c]);
@@ -117,10 +157,13 @@ impl Skip {
 
     /// Whether the map was made for these settings and this volume: another one gives a wrong picture.
     pub(crate) fn suits(&self, source: &(impl BrickSource + ?Sized), settings: &Settings) -> bool {
-        self.layout == *source.layout() && self.rescale == source.info().rescale && self.visible == visible(settings)
+        self.layout == *source.layout()
+            && self.rescale == source.info().rescale
+            && self.visible == visible(settings)
+            && self.harsh == harsh(settings)
     }
 
-    /// Distances, i fastest, and how many cells there are along each axis.
+    /// Distances (with [`GENTLE`]), i fastest, three bytes more than there are cells, and how many cells there are along each axis.
     pub(crate) fn distances(&self) -> (&[u8], [usize; 3]) {
         (&self.distance, self.counts)
     }
@@ -132,7 +175,8 @@ impl Skip {
 
     /// Share of cells in which something can be seen.
     pub fn occupied_share(&self) -> f64 {
-        self.distance.iter().filter(|&&d| d == 0).count() as f64 / self.distance.len() as f64
+        let cells = &self.distance[..self.distance.len() - PADDING];
+        cells.iter().filter(|&&d| d & !GENTLE == 0).count() as f64 / cells.len() as f64
     }
 
     #[inline]
@@ -140,17 +184,18 @@ impl Skip {
         (cell[2] * self.counts[1] + cell[1]) * self.counts[0] + cell[0]
     }
 
-    /// Which cells of a brick are occupied. Cells that begin at or beyond the last voxel hold no sample.
-    fn occupied_cells(&self, ranges: &[[i16; 2]; CELLS], id: u32) -> [bool; CELLS] {
+    /// State of a brick's cells. Cells that begin at or beyond the last voxel hold no sample.
+    fn states(&self, ranges: &[[i16; 2]; CELLS], id: u32) -> [u8; CELLS] {
         let first = self.layout.first_voxel(id);
         std::array::from_fn(|n| {
             let cell = [n % CELLS_EDGE, n / CELLS_EDGE % CELLS_EDGE, n / (CELLS_EDGE * CELLS_EDGE)];
             if (0..3).any(|c| first[c] + cell[c] * CELL + 1 >= self.layout.size[c].max(2)) {
-                return false;
+                return REACH;
             }
             let ends = ranges[n].map(|v| self.rescale.value(f64::from(v)));
             let (a, b) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
-            self.visible.iter().any(|i| b >= i[0] && a <= i[1])
+            let meets = |intervals: &[[f64; 2]]| intervals.iter().any(|i| b >= i[0] && a <= i[1]);
+            state(meets(&self.visible), !meets(&self.harsh))
         })
     }
 
@@ -162,7 +207,8 @@ impl Skip {
         let mut stamps = std::mem::take(&mut self.stamps);
         let this = &*self;
         // one layer of bricks is CELLS_EDGE slices of cells: disjoint memory for each task
-        let changed = distance
+        let cells = distance.len() - PADDING;
+        let changed = distance[..cells]
             .par_chunks_mut(nx * ny * CELLS_EDGE)
             .zip(stamps.par_chunks_mut(bx * by))
             .enumerate()
@@ -171,13 +217,13 @@ impl Skip {
                 for (n, stamp) in stamps.iter_mut().enumerate() {
                     let id = (layer * bx * by + n) as u32;
                     *stamp = source.stamp(id);
-                    let occupied = this.occupied_cells(&source.brick(id).cells, id);
+                    let states = this.states(&source.brick(id).cells, id);
                     let (i0, j0) = (n % bx * CELLS_EDGE, n / bx * CELLS_EDGE);
-                    for (c, &now) in occupied.iter().enumerate() {
+                    for (c, &now) in states.iter().enumerate() {
                         let (i, j, k) = (i0 + c % CELLS_EDGE, j0 + c / CELLS_EDGE % CELLS_EDGE, c / (CELLS_EDGE * CELLS_EDGE));
                         let cell = &mut cells[(k * ny + j) * nx + i];
-                        changed += usize::from(now != (*cell == 0));
-                        *cell = if now { 0 } else { REACH };
+                        changed += usize::from((now & !GENTLE == 0) != (*cell & !GENTLE == 0));
+                        *cell = now;
                     }
                 }
                 changed
@@ -200,7 +246,7 @@ impl Skip {
         for k in low[2]..high[2] {
             for j in low[1]..high[1] {
                 for v in &mut d[row_at(j, k) + low[0]..row_at(j, k) + high[0]] {
-                    *v = if *v == 0 { 0 } else { REACH };
+                    *v = if *v & !GENTLE == 0 { *v } else { REACH };
                 }
             }
         }
@@ -216,17 +262,21 @@ impl Skip {
                 }
                 let row = &d[row_at(jj, kk)..row_at(jj, kk) + nx];
                 for i in first..=last {
-                    let side = row[i.saturating_sub(1)].min(row[(i + 1).min(nx - 1)]);
-                    best[i] = best[i].min(row[i]).min(side);
+                    let side = (row[i.saturating_sub(1)] & !GENTLE).min(row[(i + 1).min(nx - 1)] & !GENTLE);
+                    best[i] = best[i].min(row[i] & !GENTLE).min(side);
                 }
             }
             let row = &mut d[row_at(j, k)..row_at(j, k) + nx];
             let mut previous = match forward {
-                true if first > 0 => row[first - 1],
-                false if last + 1 < nx => row[last + 1],
+                true if first > 0 => row[first - 1] & !GENTLE,
+                false if last + 1 < nx => row[last + 1] & !GENTLE,
                 _ => REACH,
             };
             let mut visit = |i: usize| {
+                if row[i] & !GENTLE == 0 {
+                    previous = 0;
+                    return;
+                }
                 let v = row[i].min(best[i].saturating_add(1)).min(previous.saturating_add(1));
                 row[i] = v;
                 previous = v;

@@ -11,6 +11,9 @@ use thiserror::Error;
 /// Entries of the table that kernels read: with the default CT range, one an HU.
 pub(crate) const ENTRIES: usize = 4096;
 
+/// log₂ of what the most opaque entry lets through: nothing that a byte could show, even through the shortest piece of a step.
+const OPAQUE: f64 = -100.0;
+
 /// Why a transfer function was refused.
 #[derive(Debug, Error, Clone, PartialEq)]
 pub enum TransferError {
@@ -242,6 +245,25 @@ impl Transfer {
     }
 }
 
+impl Transfer {
+    /// Closed intervals of HU in which the opacity over 1 mm reaches a limit (or where the nearest table entry's may).
+    pub(crate) fn as_opaque_as(&self, limit: f64) -> Vec<[f64; 2]> {
+        let [low, high] = self.range();
+        let margin = (high - low) / (ENTRIES - 1) as f64;
+        let p = &self.opacity;
+        let (first, last) = (p[0], p[p.len() - 1]);
+        let inner = p.windows(2).filter(|w| w[0][1] >= limit || w[1][1] >= limit).map(|w| {
+            let ([a, at_a], [b, at_b]) = (w[0], w[1]);
+            // where the line reaches the limit, if only one end does
+            let crossing = a + (b - a) * ((limit - at_a) / (at_b - at_a)).clamp(0.0, 1.0);
+            [if at_a >= limit { a } else { crossing }, if at_b >= limit { b } else { crossing }]
+        });
+        let below = (first[1] >= limit).then_some([f64::NEG_INFINITY, first[0]]);
+        let above = (last[1] >= limit).then_some([last[0], f64::INFINITY]);
+        below.into_iter().chain(inner).chain(above).map(|[a, b]| [a - margin, b + margin]).collect()
+    }
+}
+
 /// Linear between points, constant beyond; at a double point the later one holds from there on.
 fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     let after = points.partition_point(|p| p[0] <= x);
@@ -256,9 +278,9 @@ fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     std::array::from_fn(|c| a[c] + (b[c] - a[c]) * t)
 }
 
-/// The transfer function as the kernels read it: colour and opacity of one step, by index = HU · scale + offset.
+/// The transfer function as the kernels read it: colour and log₂ of what one step lets through, by index = HU · scale + offset.
 pub(crate) struct Table {
-    /// r, g, b, α of one step
+    /// r, g, b, log₂(1 − α) of one step
     pub entries: Vec<[f32; 4]>,
     pub scale: f64,
     pub offset: f64,
@@ -273,8 +295,9 @@ impl Table {
             .map(|n| {
                 let hu = low + n as f64 / scale;
                 let [r, g, b] = transfer.color_at(hu);
-                let alpha = 1.0 - (1.0 - transfer.opacity_at(hu)).powf(step_mm);
-                [r as f32, g as f32, b as f32, alpha as f32]
+                // opaque is a number, so that pieces of a step can be taken of it
+                let through = ((1.0 - transfer.opacity_at(hu)).log2() * step_mm).max(OPAQUE);
+                [r as f32, g as f32, b as f32, through as f32]
             })
             .collect();
         Self { entries, scale, offset: -low * scale }
@@ -337,10 +360,24 @@ mod tests {
     }
 
     #[test]
+    fn opaque_intervals_hold_every_value_that_is_opaque() {
+        for preset in Preset::ALL {
+            let transfer = preset.transfer();
+            for limit in [0.0, 0.03, 0.1, 0.5, 1.0] {
+                let intervals = transfer.as_opaque_as(limit);
+                for hu in (-15_000..40_000).map(|t| f64::from(t) / 10.0) {
+                    let opaque = intervals.iter().any(|i| hu >= i[0] && hu <= i[1]);
+                    assert!(opaque || transfer.opacity_at(hu) < limit, "{} at {hu}", preset.name());
+                }
+            }
+        }
+    }
+
+    #[test]
     fn two_half_steps_lose_what_one_step_loses() {
         let (one, half) = (Table::new(&Transfer::default(), 1.0), Table::new(&Transfer::default(), 0.5));
         for (a, b) in one.entries.iter().zip(&half.entries) {
-            assert!((1.0 - a[3] - (1.0 - b[3]) * (1.0 - b[3])).abs() < 1e-6);
+            assert!((a[3] - 2.0 * b[3]).abs() < 1e-5);
         }
     }
 }
