@@ -16,7 +16,7 @@ pub const MAX_JUMP_MM: f64 = 10.0;
 /// Longest time step that is believed [s]; after a longer pause the state moves on by this much.
 pub const MAX_STEP_S: f64 = 0.02;
 /// Position of the foot point [mm]: far below what a device resolves, far above f64 noise.
-pub const FOOT_TOLERANCE_MM: f64 = 1e-5;
+pub const FOOT_TOLERANCE_MM: f64 = 1e-4;
 /// Balls of a tool: each costs 2–4 µs in contact, and a tick has 50 µs.
 pub const MAX_NODES: usize = 16;
 /// Nodes that look around for tissue in one tick, in turn: 1–2 µs each. Of 16 nodes each looks every fourth tick, in which a hand at 0.3 m/s

@@ -11,8 +11,8 @@
 
 use crate::{
     V3,
-    coupling::Coupling,
-    device::DevicePose,
+    coupling::{Coupling, CouplingError},
+    device::{DevicePose, DeviceProfile},
     finite,
     limits::{MAX_JUMP_MM, MAX_NODES, MAX_SEARCHES, MAX_STEP_S},
     material::TissueTable,
@@ -94,6 +94,34 @@ impl HapticConfig {
             max_torque_n_mm: 0.0,
             max_torque_slew_n_mm_per_s: 0.0,
         }
+    }
+
+    /// The same on a device that tells what it is: gains lowered to what it renders passively with its damping and delay, its limits of force and
+    /// torque, and the passivity controller on, with its delay, encoder step and mass. And whether the gains were lowered.
+    ///
+    /// # Errors
+    /// When a gain is none, or the device has no damping at all.
+    pub fn on_device(
+        radius_mm: f64,
+        stiffness_n_per_mm: f64,
+        damping_n_s_per_mm: f64,
+        period_s: f64,
+        device: &DeviceProfile,
+    ) -> Result<(Self, bool), CouplingError> {
+        let stiffness = stiffness_n_per_mm.min(device.max_stiffness_n_per_mm);
+        let (coupling, lowered) =
+            Coupling::lowered_delayed(stiffness, damping_n_s_per_mm, device.damping_n_s_per_mm, period_s, device.delay_s)?;
+        let mut config = Self::new(radius_mm, coupling);
+        config.period_s = period_s;
+        config.limits.max_force_n = device.max_force_n;
+        config.passivity = true;
+        config.pose_delay_ticks = (device.delay_s / period_s).ceil() as usize;
+        config.pose_quantum_mm = device.quantum_mm;
+        config.device_mass_kg = device.mass_kg;
+        config.max_torque_n_mm = device.max_torque_n_mm;
+        // as the force: its whole range in some 30 ms
+        config.max_torque_slew_n_mm_per_s = 30.0 * device.max_torque_n_mm;
+        Ok((config, lowered || stiffness < stiffness_n_per_mm))
     }
 }
 

@@ -42,6 +42,10 @@ fn force_on_a_ball_has_its_normal_within_one_degree_and_its_size_within_one_per_
                 }
             }
         }
+        #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
+        {
+            println!("R {radius} mm: normal within {worst_angle:.3}°, size within {:.3} %", worst_size * 100.0);
+        }
         assert!(worst_angle < 1.0 && worst_size < 0.01, "R {radius}: {worst_angle:.3}°, {:.3} %", worst_size * 100.0);
     }
 }
@@ -95,5 +99,48 @@ fn sliding_over_rough_tissue_gives_no_step() {
         }
         assert!(out.in_contact, "{n}");
     }
+    assert!(worst <= 0.05, "worst step {:.1} %", worst * 100.0);
+}
+
+/// A tip that slides at 50 mm/s over voxels while commits dent the tissue under it, as a deformation would: a dent whose slope is the link limit, of
+/// part of the tip's depth, every 30 ms. No step between ticks above 5 % of max(force, 0.5 N).
+#[test]
+fn sliding_across_commits_gives_no_step() {
+    let mut dents: Vec<(V3, f64)> = Vec::new();
+    let make = |dents: &[(V3, f64)]| {
+        sampled(64, |x| {
+            let depth = dents.iter().map(|(at, depth)| depth - 0.2 * ((x.x - at.x).abs() + (x.y - at.y).abs())).fold(0.0, f64::max);
+            edge(-x.z - depth)
+        })
+    };
+    let (mut volume, mut epoch, mut told) = (make(&dents), 1, None::<maille_contact::ToolMove>);
+    let mut d = Driver::new(plain(2.0, SPRING));
+    let (mut last, mut worst, mut felt) = (None::<V3>, 0.0f64, 0);
+    for n in 0..1400u64 {
+        if n % 30 == 0
+            && let Some(m) = told.take()
+        {
+            let foot = V3::from(m.contact_mm) - V3::from(m.normal) * (0.7 * m.depth_mm);
+            dents.push((foot, -foot.z));
+            volume = make(&dents);
+            epoch += 1;
+        }
+        // lands, then slides 50 mm
+        let x = if n < 400 { V3::new(-25.0, 0.3, 5.0 - 0.01 * n as f64) } else { V3::new(-25.0 + 0.05 * (n - 400) as f64, 0.3, 1.0) };
+        let out = d.tick(&Isosurface::new(&volume, 0.0), epoch, x);
+        told = out.tool_move.or(told);
+        let f = V3::from(out.force_n);
+        if let Some(last) = last.replace(f)
+            && n >= 400
+        {
+            worst = worst.max((f - last).norm() / f.norm().max(0.5));
+            felt += u32::from(out.in_contact);
+        }
+    }
+    #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
+    {
+        println!("sliding across {} commits: worst step {:.2} %", dents.len(), worst * 100.0);
+    }
+    assert!(dents.len() > 20 && felt > 950, "{} commits, felt in {felt} ticks", dents.len());
     assert!(worst <= 0.05, "worst step {:.1} %", worst * 100.0);
 }

@@ -4,7 +4,7 @@ mod common;
 
 use bytemuck::Zeroable;
 use common::*;
-use maille_contact::{Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, SimulatedHand, Surface, TickInputs};
+use maille_contact::{Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, SimulatedHand, Surface, TickInputs, ToolShape};
 use maille_contract::histogram::SharedHistogram;
 use maille_realtime::monotonic_ns;
 use maille_volume::{BrickSource, BrickedVolume, io::read_volume};
@@ -26,7 +26,8 @@ fn head() -> Option<BrickedVolume> {
 
 /// Slides along an arc around the head's middle at 50 mm/s, the hand wanting 12 mm below the surface. Gives the largest step in parts of
 /// max(force, 0.5 N), the part of ticks in contact, and prints the time of a tick.
-fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64, grip: Grip) -> (f64, f64) {
+fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, shape: ToolShape, grip: Grip) -> (f64, f64) {
+    let radius_mm = shape.nodes()[0].radius_mm;
     let tissue = Isosurface::new(volume, threshold);
     let center = V3::from(volume.info().grid.center());
     let direction = |angle: f64| V3::new(angle.sin(), -angle.cos(), elevation).normalize();
@@ -38,7 +39,11 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64,
         }
         r
     };
-    let mut core = HapticCore::new(HapticConfig::new(radius_mm, Coupling::new(2.0, 5e-4, 0.003, 1e-3).unwrap()));
+    let mut core = HapticCore::new(HapticConfig {
+        shape,
+        passivity: true,
+        ..HapticConfig::new(radius_mm, Coupling::new(2.0, 5e-4, 0.003, 1e-3).unwrap())
+    });
     let start = direction(-0.4);
     let from = center + start * (surface(start) + radius_mm + 4.0);
     let mut hand = SimulatedHand::new(grip, from.into(), (-start).into());
@@ -74,7 +79,12 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, radius_mm: f64,
     }
     #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
     {
-        println!("threshold {threshold}: tick {:?} ns, worst step {:.2} %", compute.percentiles(), worst * 100.0);
+        println!(
+            "{} balls, threshold {threshold}: tick {:?} ns, worst step {:.2} %",
+            shape.nodes().len(),
+            compute.percentiles(),
+            worst * 100.0
+        );
     }
     (worst, f64::from(touched) / (ticks - 1000) as f64)
 }
@@ -86,9 +96,20 @@ fn sliding_over_skin_and_skull_keeps_contact_and_gives_no_step() {
     for (threshold, elevation, grip) in
         [(-300.0, 0.35, Grip::LIGHT), (-300.0, 0.35, Grip::FULL), (276.0, 1.2, Grip::LIGHT), (276.0, 1.2, Grip::FULL)]
     {
-        let (worst, touched) = slide(&volume, threshold, elevation, 3.0, grip);
+        let (worst, touched) = slide(&volume, threshold, elevation, ToolShape::sphere(3.0), grip);
         assert!(touched > 0.9, "threshold {threshold}: {:.0} % of ticks in contact", touched * 100.0);
         assert!(worst <= 0.05, "threshold {threshold}: worst step {:.1} %", worst * 100.0);
+    }
+}
+
+/// A shaft of sixteen balls and a probe of nine that slide over skin: bounded work, and the same rule for steps.
+#[test]
+fn a_shaft_and_a_probe_slide_over_skin_without_a_step() {
+    let Some(volume) = head() else { return };
+    for shape in [ToolShape::capsule(3.0, 45.0), ToolShape::probe(40.0, 60.0, 8.0)] {
+        let (worst, touched) = slide(&volume, -300.0, 0.35, shape, Grip::FULL);
+        assert!(touched > 0.9, "{} balls: {:.0} % of ticks in contact", shape.nodes().len(), touched * 100.0);
+        assert!(worst <= 0.05, "{} balls: worst step {:.1} %", shape.nodes().len(), worst * 100.0);
     }
 }
 

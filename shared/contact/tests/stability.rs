@@ -4,8 +4,8 @@ mod common;
 
 use common::*;
 use maille_contact::{
-    AnalyticSurface, Coupling, Device, DevicePose, Grip, HapticConfig, HapticCore, Limits, Material, SimulatedHand, Surface, TickInputs,
-    TissueTable,
+    AnalyticSurface, Coupling, Device, DevicePose, DeviceProfile, Grip, HapticConfig, HapticCore, Limits, Material, SimulatedHand, Surface,
+    TickInputs, TissueTable,
 };
 use maille_volume::VolumeSample;
 
@@ -126,4 +126,31 @@ fn the_largest_stable_stiffness_is_the_formulas() {
             }
         }
     }
+}
+
+/// What a device tells of itself becomes gains, limits and a passivity controller; delay lowers what is allowed.
+#[test]
+fn a_device_that_tells_what_it_is_gets_gains_that_it_renders_passively() {
+    let device = |delay_s| DeviceProfile {
+        name: "made up",
+        max_force_n: 3.0,
+        max_torque_n_mm: 100.0,
+        max_stiffness_n_per_mm: 1.0,
+        damping_n_s_per_mm: 1e-3,
+        coulomb_n: 0.1,
+        quantum_mm: 0.05,
+        mass_kg: 0.07,
+        delay_s,
+        workspace_mm: 75.0,
+    };
+    for (delay, ticks) in [(0.0, 0), (1e-3, 1), (4.5e-3, 5)] {
+        let (config, lowered) = HapticConfig::on_device(2.0, 50.0, 2e-4, T, &device(delay)).unwrap();
+        assert!(lowered && config.passivity);
+        assert_eq!((config.pose_delay_ticks, config.pose_quantum_mm, config.device_mass_kg), (ticks, 0.05, 0.07));
+        assert_eq!((config.limits.max_force_n, config.max_torque_n_mm), (3.0, 100.0));
+        let (k, b) = (config.coupling.stiffness_n_per_mm(), config.coupling.damping_n_s_per_mm());
+        assert!(1e-3 > k * (T / 2.0 + delay) + b && k <= 1.0 && k > 0.5 * 1e-3 / (T / 2.0 + delay).max(1e-3), "{delay}: {k} {b}");
+    }
+    assert!(!HapticConfig::on_device(2.0, 0.1, 0.0, T, &device(0.0)).unwrap().1);
+    assert!(HapticConfig::on_device(2.0, f64::NAN, 0.0, T, &device(f64::NAN)).is_err());
 }
