@@ -140,7 +140,7 @@ pub struct Mapper {
     values: Vec<Values>,
     /// one a thread, taken and put back
     workspaces: Mutex<Vec<Workspace>>,
-    /// beside voids and cuts: for each brick the range of displacements [mm] when it was mapped last
+    /// for each brick the range of displacements [mm] when it was mapped last: beside voids and cuts, what tissue leaves
     seen: Vec<rows::Range>,
 }
 
@@ -174,13 +174,10 @@ impl Mapper {
         // 1. which voxels: each changed brick covers its part
         wanted.clear(mail.layout());
         let threads = rayon::current_num_threads();
+        seen.resize(mail.layout().count(), [[0.0; 2]; 3]);
         if gaps {
-            seen.resize(mail.layout().count(), [[0.0; 2]; 3]);
             for changed in &region.bricks {
                 wanted.add_beside_gaps(mail, changed, seen);
-            }
-            for id in region.ids() {
-                seen[id as usize] = mail.displacement_range(id);
             }
         } else if threads == 1 || region.bricks.len() < SHARED_CHANGES {
             let mut work = lend();
@@ -200,6 +197,11 @@ impl Mapper {
             for part in &parts[..region.bricks.len().div_ceil(share)] {
                 wanted.merge(part);
             }
+        }
+
+        // also without gaps: a first cut may come later
+        for id in region.ids() {
+            seen[id as usize] = mail.displacement_range(id);
         }
 
         // 2. their values, brick by brick

@@ -80,30 +80,33 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         let displacement = self.mail.displacement_brick(id).filter(|_| self.mail.displacement_range(id) != [[0.0; 2]; 3]);
         // 1. rest values everywhere; what is left are the rows whose elements moved
         let (rest, values) = (self.rest.brick(id), values.as_chunks_mut::<EDGE>().0);
-        let all_linked = !self.gaps;
-        let may_fold = !all_linked || self.mail.tissue().offset >= 1.0 / 3.0;
+        let voids = self.mail.tissue().threshold_hu.is_some();
         for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
             let from = Brick::offset(0, (row % EDGE) as isize, (row / EDGE) as isize);
             values[row].copy_from_slice(&rest.voxels[from..from + EDGE]);
             report.voxels += u64::from(span[1] - span[0]);
         }
+        let all_open = voids || self.mail.cut_brick(id).is_some();
         let open = &mut *work.open;
         for (row, span) in spans.iter().enumerate() {
             // a void may be entered by others, and tissue at rest be taken out
-            open[row] = if all_linked { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) } else { *span };
+            open[row] = if all_open { *span } else { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) };
         }
         let Some((low, high)) = bounds(open) else { return report };
         let voxels = Box3 { low: std::array::from_fn(|c| first[c] + low[c]), high: std::array::from_fn(|c| first[c] + high[c]) };
-        let range = if all_linked { preimage_box(self.mail, voxels) } else { preimage_box_beside_gaps(self.mail, voxels, &self.loaded) };
+        let range = if self.gaps { preimage_box_beside_gaps(self.mail, voxels, &self.loaded) } else { preimage_box(self.mail, voxels) };
         work.window.gather(self.mail, range);
         if work.window.at_rest() && self.mail.cut_brick(id).is_none() {
             return report;
         }
+        // far from every void and cut the map is one piece
+        let all_linked = !voids && !(self.gaps && self.is_cut(range));
+        let may_fold = !all_linked || self.mail.tissue().offset >= 1.0 / 3.0;
         let (window, found, pieces, left) = (&work.window, &mut *work.found, &mut work.pieces, &mut work.left);
-        if may_fold {
-            pieces.gather(self.rest, self.mail, window);
-        } else {
+        if all_linked {
             pieces.all_tissue(window);
+        } else {
+            pieces.gather(self.rest, self.mail, window);
         }
         let origin = window.low();
         let mut sampler = RestSampler::new(self.rest, origin, window.size(), self.options.sampling);
@@ -181,6 +184,13 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         }
         left.clear();
         report
+    }
+
+    /// Whether a link of the bricks that hold a box of elements, or of those before them, is cut.
+    fn is_cut(&self, range: Box3) -> bool {
+        let layout = self.mail.layout();
+        let bricks = |c: usize| range.low[c].saturating_sub(1) / EDGE..=range.high[c] / EDGE;
+        bricks(2).any(|k| bricks(1).any(|j| bricks(0).any(|i| self.mail.cut_brick(layout.id([i, j, k])).is_some())))
     }
 
     /// Damped Newton from the voxel's own displacement; the fourth lane is not 0 where it did not converge.
