@@ -1,10 +1,11 @@
 //! A restart changes nothing: the real engine on a real store, dropped or killed at random instants, against one that never was.
 //!
-//! Two worlds get the same random work: pushes, steps of relaxation, changes of the threshold. In one the process goes on for ever; in
+//! Two worlds get the same random work: pushes into tissue that keeps a part of them, cuts, steps of relaxation of both kinds, changes of
+//! the threshold. In one the process goes on for ever; in
 //! the other it is ended and started again, between steps, and in the middle of them at every named point of the store
 //! (`fault::die_here`: the stack is unwound, which writes nothing into shared memory). A step whose commit had not become visible is
-//! done again by the successor; one that had is not. After every step all voxels, skip cells, displacements and the state are
-//! the same, bit for bit.
+//! done again by the successor; one that had is not. After every step all voxels, skip cells, displacements, plastic parts, cuts and
+//! the state are the same, bit for bit.
 //!
 //! `MAILLE_RESTARTS=2000 cargo test -p maille-deformation recovery` looks longer; `MAILLE_SEED` gives other work.
 
@@ -12,10 +13,11 @@ use crate::{
     restore::restore,
     step::{Done, Engine},
 };
+use maille_chainmail::{PlasticBand, RelaxOptions, Triangle, swept_blade};
 use maille_contract::{Role, Stamp, ToolMove};
 use maille_scene::{Pins, Scene};
 use maille_store::{
-    CommitOutcome, Reader, Snapshot, StoreKeeper, StoreSizes, Writer,
+    CommitOutcome, Cuts, DISPLACEMENT_LEN, Plastic, Reader, Snapshot, StoreKeeper, StoreSizes, Writer,
     fault::{Died, Point, die_here, live_on},
 };
 use maille_transport::{ControlMap, Domain};
@@ -105,6 +107,7 @@ impl World {
         let (writer, reader) = (Writer::open(&self.domain).unwrap(), Reader::open(&self.domain, Role::Deformation).unwrap());
         writer.audit().unwrap();
         let mut engine = Engine::new(&self.scene, reader.info());
+        engine.mail.set_plasticity(vec![PlasticBand { from_hu: -500.0, fraction: 0.2 }, PlasticBand { from_hu: 60.0, fraction: 0.5 }]);
         restore(&mut engine, &writer);
         if let Some(threshold_hu) = shown {
             engine.set_threshold(threshold_hu);
@@ -132,7 +135,11 @@ impl Drop for World {
 #[derive(Clone, Copy, Debug)]
 enum Work {
     Push(ToolMove),
+    /// back to rest, all alike
     Relax,
+    /// back to what is plastic, by the energy; a batch is the middle of a relaxation
+    Settle,
+    Cut([Triangle; 2]),
 }
 
 impl Process {
@@ -140,6 +147,15 @@ impl Process {
         match work {
             Work::Push(message) => self.engine.step(&message, now_ns, &self.reader, &mut self.writer),
             Work::Relax => self.engine.relax(now_ns, 66_000_000, &self.reader, &mut self.writer),
+            Work::Settle => {
+                let options = RelaxOptions { sweeps: 1, ..RelaxOptions::default() };
+                let region = self.engine.mail.relax_elastic(&self.reader.rest(), &options, &[], &|| false).region;
+                (!region.is_empty()).then(|| self.engine.commit(&region, &self.reader, &mut self.writer))
+            }
+            Work::Cut(triangles) => {
+                let region = self.engine.mail.cut_triangles(&self.reader.rest(), &triangles);
+                (!region.is_empty()).then(|| self.engine.commit(&region, &self.reader, &mut self.writer))
+            }
         }
     }
 }
@@ -158,26 +174,42 @@ fn push(random: &mut Random, sequence: u64) -> ToolMove {
     ToolMove { stamp, tip_mm: tip, outside_mm: outside, contact_mm: contact, normal, depth_mm: depth, radius_mm: radius }
 }
 
+/// A slit of some millimetres from the surface down.
+fn slit(random: &mut Random) -> [Triangle; 2] {
+    let (from, angle) = ([random.within(6.0, 42.0), random.within(6.0, 34.0)], random.within(0.0, 3.0));
+    let to = [from[0] + 7.0 * angle.cos(), from[1] + 7.0 * angle.sin()];
+    let deep = SURFACE_MM - random.within(3.0, 8.0);
+    let edge = |at: [f64; 2]| [[at[0], at[1], SURFACE_MM + 2.0], [at[0], at[1], deep]];
+    swept_blade(edge(from), edge(to))
+}
+
 /// The first difference between what two worlds show.
 fn difference(a: &Snapshot<'_>, b: &Snapshot<'_>) -> Option<String> {
     if a.epoch() != b.epoch() || a.state() != b.state() {
         let at = (0..a.state().len()).find(|&n| a.state()[n] != b.state()[n]);
         return Some(format!("epochs {} and {}, first byte of the state that differs {at:?}", a.epoch(), b.epoch()));
     }
-    for id in 0..a.layout().count() as u32 {
+    let bricks = || 0..a.layout().count() as u32;
+    // causes before effects: what the engine holds, then what is drawn
+    for id in bricks() {
+        let bits = |d: Option<&[f32; DISPLACEMENT_LEN]>| d.map(|d| d.map(f32::to_bits));
+        if bits(a.displacement(id)) != bits(b.displacement(id)) {
+            return Some(format!("displacement of brick {id}"));
+        }
+        if bits(a.channel::<Plastic>(id)) != bits(b.channel::<Plastic>(id)) {
+            return Some(format!("plastic part of brick {id}"));
+        }
+        if a.channel::<Cuts>(id) != b.channel::<Cuts>(id) {
+            return Some(format!("cuts of brick {id}"));
+        }
+    }
+    for id in bricks() {
         let (x, y) = (a.brick(id), b.brick(id));
         if let Some(n) = (0..x.voxels.len()).find(|&n| x.voxels[n] != y.voxels[n]) {
             return Some(format!("brick {id}, stored voxel {n}: {} and {}", x.voxels[n], y.voxels[n]));
         }
         if x.cells != y.cells {
             return Some(format!("skip cells of brick {id}"));
-        }
-        let bits = |s: &Snapshot<'_>| s.displacement(id).map(|d| d.map(f32::to_bits));
-        if bits(a) != bits(b) {
-            return Some(format!("displacement of brick {id}"));
-        }
-        if a.channel::<maille_store::Cuts>(id) != b.channel::<maille_store::Cuts>(id) {
-            return Some(format!("cuts of brick {id}"));
         }
     }
     None
@@ -188,6 +220,7 @@ fn difference(a: &Snapshot<'_>, b: &Snapshot<'_>) -> Option<String> {
 struct Tally {
     commits: u64,
     relaxations: u64,
+    cuts: u64,
     /// between steps
     restarts: u64,
     /// at a point, before the commit was visible
@@ -212,15 +245,19 @@ fn run(scene: &Scene, seed: u64, wanted: u64) -> Tally {
                 world.process().engine.set_threshold(shown.expect("just set"));
             }
         }
-        let work = if random.below(3) == 0 {
-            Work::Relax
-        } else {
-            sequence += 1;
-            Work::Push(push(&mut random, sequence))
+        let work = match random.below(12) {
+            0 | 1 => Work::Relax,
+            2..=4 => Work::Settle,
+            5 => Work::Cut(slit(&mut random)),
+            _ => {
+                sequence += 1;
+                Work::Push(push(&mut random, sequence))
+            }
         };
         let done = whole.process().work(work, now_ns);
         tally.commits += u64::from(done.is_some());
-        tally.relaxations += u64::from(done.is_some() && matches!(work, Work::Relax));
+        tally.relaxations += u64::from(done.is_some() && matches!(work, Work::Relax | Work::Settle));
+        tally.cuts += u64::from(done.is_some() && matches!(work, Work::Cut(_)));
 
         if random.below(5) == 0 {
             broken.start(shown);
@@ -277,17 +314,18 @@ fn a_restart_anywhere_changes_no_bit_of_what_follows() {
         scene.deformation.pins = pins;
         let tally = run(&scene, seed + n as u64, wanted);
         println!(
-            "{pins:?}: {} commits ({} of relaxation) the same bit for bit through {} restarts between steps, {} deaths before the commit and {} after \
+            "{pins:?}: {} commits ({} of relaxation, {} cuts) the same bit for bit through {} restarts between steps, {} deaths before the commit and {} after \
              it, at {} points: {:?}",
             tally.commits,
             tally.relaxations,
+            tally.cuts,
             tally.restarts,
             tally.deaths_before,
             tally.deaths_after,
             tally.points.len(),
             tally.points
         );
-        assert!(tally.commits > wanted / 2 && tally.relaxations > wanted / 20, "{tally:?}");
+        assert!(tally.commits > wanted / 2 && tally.relaxations > wanted / 20 && tally.cuts > 0, "{tally:?}");
         assert!(tally.deaths_before > wanted / 6 && tally.deaths_after > wanted / 12 && tally.points.len() >= 12, "{tally:?}");
     }
 }

@@ -2,15 +2,22 @@
 
 use crate::{state::State, step::Engine};
 use maille_chainmail::DisplacementBrick;
-use maille_store::Writer;
+use maille_store::{Cuts, Plastic, Writer};
 
-/// Puts every committed displacement back, and the state.
+/// Puts every committed displacement back, its plastic part, the cut links, and the state.
 pub(crate) fn restore(engine: &mut Engine, writer: &Writer) {
     for id in 0..writer.layout().count() as u32 {
         if let Some(numbers) = writer.displacement(id) {
             engine.mail.restore_brick(id, bytemuck::cast_ref::<_, DisplacementBrick>(numbers));
         }
+        if let Some(numbers) = writer.channel::<Plastic>(id) {
+            engine.mail.restore_plastic_brick(id, bytemuck::cast_ref::<_, DisplacementBrick>(numbers));
+        }
+        if let Some(cuts) = writer.channel::<Cuts>(id) {
+            engine.mail.restore_cut_brick(id, cuts);
+        }
     }
+    engine.resume();
     if let Some(state) = State::read(writer.state()) {
         engine.set_threshold(state.threshold_hu);
         engine.state = state;

@@ -14,7 +14,7 @@ use maille_contract::{Stamp, ToolMove};
 use maille_displacement::{along_axes, in_patient};
 use maille_mapper::{BrickSink, MapOptions, Mapper, rest_position};
 use maille_scene::{Pins, Push, Scene};
-use maille_store::{CommitOutcome, Reader, Transaction, Writer};
+use maille_store::{CommitOutcome, Cuts, Plastic, Reader, Transaction, Writer};
 use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
 
 /// Pushes shorter than this are not worth a transaction [mm].
@@ -83,6 +83,11 @@ impl Engine {
         Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, mapper: Mapper::new(), relaxation_s }
     }
 
+    /// What the store shows is what the mail holds: said once after the mail was restored.
+    pub fn resume(&mut self) {
+        self.mapper = Mapper::resume(&self.mail);
+    }
+
     /// Tissue begins at another value from now on.
     pub fn set_threshold(&mut self, threshold_hu: f64) {
         self.state.threshold_hu = threshold_hu;
@@ -130,11 +135,11 @@ impl Engine {
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))
     }
 
-    /// Maps what changed and commits voxels, displacements and state together.
-    fn commit(&mut self, region: &ChangedRegion, reader: &Reader, writer: &mut Writer) -> Done {
+    /// Maps what changed and commits voxels, displacements with their plastic part, cut links and state together.
+    pub fn commit(&mut self, region: &ChangedRegion, reader: &Reader, writer: &mut Writer) -> Done {
         let mut transaction = writer.begin();
         let mapped = self.mapper.remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
-        self.commit_displacement(region, &mut transaction);
+        self.commit_elements(region, &mut transaction);
         self.state.write(transaction.state_mut());
         let bricks = mapped.bricks.len() as u64;
         Done { outcome: transaction.commit(), moved_elements: 0, bricks, failures: mapped.failures, refused_mm: [0.0; 3] }
@@ -157,10 +162,18 @@ impl Engine {
         (length >= SHORTEST_PUSH_MM).then_some((from, push))
     }
 
-    fn commit_displacement(&self, region: &ChangedRegion, transaction: &mut Transaction<'_>) {
+    /// All that ChainMail holds of the elements that changed. Plastic parts and cuts exist only where an effect makes them, and then the
+    /// plan has their channels.
+    fn commit_elements(&self, region: &ChangedRegion, transaction: &mut Transaction<'_>) {
         for id in region.ids() {
             if let Some(brick) = self.mail.displacement_brick(id) {
                 transaction.displacement_mut(id).copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(brick)));
+            }
+            if let Some(brick) = self.mail.plastic_brick(id) {
+                transaction.channel_mut::<Plastic>(id).copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(brick)));
+            }
+            if let Some(cuts) = self.mail.cut_brick(id) {
+                transaction.channel_mut::<Cuts>(id).copy_from_slice(cuts);
             }
         }
     }
