@@ -14,6 +14,8 @@
 //!
 //! Unsafe code lives in `foreign` alone (calls into shared objects that were opened at run time).
 
+#![deny(unsafe_code)]
+
 pub mod error;
 mod forcedimension;
 #[allow(unsafe_code)] // calls into vendors' shared objects; each block has its reason

@@ -14,7 +14,8 @@ pub const TOUCH: DeviceProfile = DeviceProfile {
     coulomb_n: 0.2,
     quantum_mm: 0.055,
     mass_kg: 0.045,
-    delay_s: 0.001,
+    // a pose waits up to a period for the tick, and the force up to one for the device
+    delay_s: 0.002,
     workspace_mm: 75.0,
 };
 
@@ -28,7 +29,7 @@ pub const OMEGA: DeviceProfile = DeviceProfile {
     coulomb_n: 0.1,
     quantum_mm: 0.01,
     mass_kg: 0.1,
-    delay_s: 0.001,
+    delay_s: 0.002,
     workspace_mm: 75.0,
 };
 
@@ -46,7 +47,7 @@ pub const INVERSE3: DeviceProfile = DeviceProfile {
     coulomb_n: 0.02,
     quantum_mm: 0.05,
     mass_kg: 0.08,
-    // service, socket and two schedulers
-    delay_s: 0.002,
+    // as the others, and a service and a socket between
+    delay_s: 0.003,
     workspace_mm: 75.0,
 };

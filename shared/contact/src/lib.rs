@@ -1,19 +1,21 @@
 //! Touch: contact of a tool's tip with the isosurface of a volume, and the force it gives to a hand.
 //!
 //! ```text
-//! device ──pose──▶ proxy ──depth, normal──▶ tissue law + friction ──▶ blend ──▶ passivity ──▶ shaper ──force──▶ device
-//!                   │ on the surface that the threshold defines                                (limits, fades)
-//!                   └──▶ tool moves, when the tip presses in
+//! device ──pose──▶ nodes: proxy ──depth, normal──▶ tissue law + friction ──▶ blend ──▶ shaper ──▶ passivity ──force, torque──▶ device
+//!                   │ on the surface that the threshold defines                     (limits, fades)
+//!                   └──▶ tool moves, when the tool presses in
 //! ```
 //!
-//! [`HapticCore::tick`] is the whole chain. Its parts can be used alone: [`surface`] (what is touched), [`proxy`] (where
-//! the tip is held), [`material`] (stiffness of tissue), [`friction`], [`coupling`] (the bound on what a device can render
-//! stably), [`passivity`], [`shaper`] (limits and fades) and [`device`] (scripted, simulated and page-driven devices).
+//! [`HapticCore::tick`] is the whole chain. Its parts can be used alone: [`surface`] (what is touched), [`shape`] (the balls of a tool), [`proxy`] (where
+//! a ball is held), [`material`] (stiffness of tissue), [`friction`], [`coupling`] (the bound on what a device can render
+//! stably), [`passivity`] (no energy out of the device's port), [`shaper`] (limits and fades) and [`device`] (scripted, simulated and
+//! page-driven devices; what a real one must do).
 //!
 //! Units: mm, N, N/mm, N·s/mm, s, values HU; time comes in as nanoseconds. Frame: the patient's (world) frame at rest.
 //!
 //! Invariants: nothing here reads a clock, locks, prints or does I/O; a tick allocates nothing and its work is bounded
-//! ([`limits`]); every force that leaves is finite and within [`Limits`], whatever comes in.
+//! ([`limits`]); every force that leaves is finite and within [`Limits`], whatever comes in. (Only a fall of the force may be steeper than the slew limit,
+//! with the passivity controller on, when less is stored than the slower fall would give out.)
 
 #![forbid(unsafe_code)]
 

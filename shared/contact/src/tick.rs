@@ -55,7 +55,8 @@ pub struct HapticConfig {
     pub passivity: bool,
     /// α_max of the passivity controller [N·s/mm]
     pub passivity_damping_n_s_per_mm: f64,
-    /// how late the device's poses are [ticks], where it is known; the passivity observer needs it
+    /// how late the device's poses are [ticks], at least: the passivity observer needs it. A tick too many only makes it cautious; with a tick too
+    /// few it pairs motion with forces of another time, and guards nothing
     pub pose_delay_ticks: usize,
     /// encoder step at the tip [mm], 0 where it is not known; the passivity observer needs it
     pub pose_quantum_mm: f64,
@@ -115,7 +116,8 @@ impl HapticConfig {
         config.period_s = period_s;
         config.limits.max_force_n = device.max_force_n;
         config.passivity = true;
-        config.pose_delay_ticks = (device.delay_s / period_s).ceil() as usize;
+        // a device that answers late also answers unevenly; a delay told too long is safe, one too short is not
+        config.pose_delay_ticks = if device.delay_s > 0.0 { (device.delay_s / period_s).ceil() as usize + 1 } else { 0 };
         config.pose_quantum_mm = device.quantum_mm;
         config.device_mass_kg = device.mass_kg;
         config.max_torque_n_mm = device.max_torque_n_mm;

@@ -49,8 +49,13 @@ struct Run {
 
 /// A hand that wants `target(t)` at a wall; the energy is that of the true motion and of the force really given.
 fn run(config: HapticConfig, grip: Grip, normal: V3, seconds: f64, target: impl Fn(f64) -> V3) -> Run {
-    let tissue = wall(normal);
     let delay = config.pose_delay_ticks;
+    run_late(config, grip, normal, seconds, delay, target)
+}
+
+/// The same with poses late by `delay` ticks, whatever the controller was told.
+fn run_late(config: HapticConfig, grip: Grip, normal: V3, seconds: f64, delay: usize, target: impl Fn(f64) -> V3) -> Run {
+    let tissue = wall(normal);
     let mut core = HapticCore::new(config);
     let mut hand = SimulatedHand::new(grip, target(0.0).into(), (-normal).into()).with_encoder(QUANTUM_MM, delay);
     let (mut run, mut energy, mut force, mut energies) = (Run::default(), 0.0f64, V3::zeros(), Vec::new());
@@ -132,6 +137,28 @@ fn a_slew_limit_is_no_licence_to_give_out_energy() {
         let (on, off) = (run(limited(true), Grip::FULL, V3::z(), 20.0, target), run(limited(false), Grip::FULL, V3::z(), 5.0, target));
         say(format!("slew 100 N/s, {delay} ms: {:.3} mJ in 20 s, {:.0} mJ in 5 s without the controller", on.most_mj, off.most_mj));
         assert!(off.most_mj > 100.0 && on.most_mj < 1.0, "{delay} ms: {on:?} {off:?}");
+    }
+}
+
+/// A delay told one tick too long, or twice the device's true lightness, errs on the safe side: the wall is softer, not livelier.
+#[test]
+fn a_delay_told_too_long_and_a_mass_told_too_small_are_safe() {
+    for delay in [0, 1, 2, 4] {
+        let stiffness = 4.0 * damping() / (T / 2.0 + delay as f64 * T);
+        for (grip, amplitude) in [(Grip::LIGHT, 19.0), (Grip::FULL, 8.0)] {
+            let target = |t: f64| V3::new(0.0, 0.0, 4.0 + amplitude * (t * 37.0).cos());
+            for told in [
+                HapticConfig { pose_delay_ticks: delay + 1, ..config(stiffness, true, delay) },
+                HapticConfig { device_mass_kg: 0.025, ..config(stiffness, true, delay) },
+            ] {
+                let on = run_late(told, grip, V3::z(), 30.0, delay, target);
+                say(format!(
+                    "{delay} ms, told {} ticks and {} kg: {:.3} mJ in 30 s, mean force {:.2} N",
+                    told.pose_delay_ticks, told.device_mass_kg, on.most_mj, on.mean_n
+                ));
+                assert!(on.most_mj < 1.0 && on.mean_n > 0.03, "{on:?}");
+            }
+        }
     }
 }
 

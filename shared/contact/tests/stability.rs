@@ -143,7 +143,7 @@ fn a_device_that_tells_what_it_is_gets_gains_that_it_renders_passively() {
         delay_s,
         workspace_mm: 75.0,
     };
-    for (delay, ticks) in [(0.0, 0), (1e-3, 1), (4.5e-3, 5)] {
+    for (delay, ticks) in [(0.0, 0), (1e-3, 2), (4.5e-3, 6)] {
         let (config, lowered) = HapticConfig::on_device(2.0, 50.0, 2e-4, T, &device(delay)).unwrap();
         assert!(lowered && config.passivity);
         assert_eq!((config.pose_delay_ticks, config.pose_quantum_mm, config.device_mass_kg), (ticks, 0.05, 0.07));
