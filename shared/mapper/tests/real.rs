@@ -1,7 +1,7 @@
 //! Ten pushes into real CTs: every voxel shows the tissue that came there, no voxel is a hole, and bricks have no borders.
 
 use maille_chainmail::{ChainMail, Motion, Pin, Tissue, enclosing_elements};
-use maille_mapper::{MapOptions, MapReport, Mapper, rest_position};
+use maille_mapper::{MapOptions, MapReport, Mapper, rest_position, tissue_rest_position};
 use maille_volume::{
     BrickSource, BrickedVolume, Volume,
     io::{ReadOptions, read},
@@ -144,4 +144,42 @@ fn ten_pushes_into_a_real_head_leave_no_holes_and_no_steps() {
 #[test]
 fn ten_pushes_into_a_real_thorax_leave_no_holes_and_no_steps() {
     check("ct_thorax_lidc0314/lidc0314_half.nrrd", &THORAX);
+}
+
+#[test]
+fn links_through_tissue_only_leave_no_holes_in_a_real_head_and_it_returns_to_its_bits() {
+    let Some(volume) = real("ct_head_invesalius/cranium_lps.nrrd") else { return };
+    let threshold = -300.0;
+    let rest = BrickedVolume::from_volume(&volume);
+    let mut mail = ChainMail::new(rest.info(), Tissue { threshold_hu: Some(threshold), ..Tissue::default() });
+    let (mut mapper, mut now) = (Mapper::new(), rest.clone());
+    let grid = &rest.info().grid;
+    let mut moved = 0;
+    for (point, vector) in HEAD {
+        // where the tool met tissue, or nothing
+        let Some(at) = tissue_rest_position(&rest, &mail, point) else { continue };
+        let motion = Motion::By(vector.map(|v| v as f32));
+        let pins: Vec<Pin> = enclosing_elements(grid, at).into_iter().map(|voxel| Pin { voxel, motion }).collect();
+        let outcome = mail.push(&rest, &pins);
+        let report = mapper.remap(&rest, &mail, &outcome.region, &mut now, &MapOptions::default());
+        assert_eq!(report.failures, 0);
+        moved += outcome.moved;
+    }
+    // tissue all around at rest that moved no further than half a voxel cannot have opened: what is there now is no air
+    let hu = |v: i16| rest.info().rescale.value(f64::from(v));
+    let mut inside = 0;
+    for n in 0..grid.voxel_count() {
+        let at = [n % grid.size[0], n / grid.size[0] % grid.size[1], n / (grid.size[0] * grid.size[1])];
+        let u = mail.displacement(at);
+        if u == [0.0; 3] || (0..3).any(|c| f64::from(u[c].abs()) > 0.5 * grid.spacing[c]) || hu(around(&rest, at, 2)[0]) < threshold {
+            continue;
+        }
+        assert!(hu(now.voxel(at[0], at[1], at[2])) >= threshold, "{at:?} is a hole: {}", now.voxel(at[0], at[1], at[2]));
+        inside += 1;
+    }
+    println!("{moved} elements moved in ten pushes, {inside} voxels deep in tissue looked at");
+    assert!(moved > 10_000 && inside > 5_000, "{moved} {inside}");
+    let region = mail.relax(0.0, 0.0);
+    mapper.remap(&rest, &mail, &region, &mut now, &MapOptions::default());
+    assert!(now.to_volume().voxels == volume.voxels);
 }
