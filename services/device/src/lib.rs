@@ -33,6 +33,7 @@ pub use link::RemoteDevice;
 pub use mounting::Mounting;
 pub use probe::{Finding, probe};
 
+use maille_contact::DeviceProfile;
 use std::path::PathBuf;
 
 /// A kind of real device.
@@ -78,11 +79,20 @@ pub struct Options {
     pub device: Option<String>,
     /// from the device's frame to the patient's
     pub mounting: Mounting,
+    /// what the device can do; `None`: the kind's usual one ([`profiles`])
+    pub profile: Option<DeviceProfile>,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { address: "127.0.0.1:10001".into(), protocol: Protocol::Auto, library: None, device: None, mounting: Mounting::default() }
+        Self {
+            address: "127.0.0.1:10001".into(),
+            protocol: Protocol::Auto,
+            library: None,
+            device: None,
+            mounting: Mounting::default(),
+            profile: None,
+        }
     }
 }
 
@@ -92,12 +102,14 @@ impl Default for Options {
 /// # Errors
 /// When the vendor's library is missing or lacks a function, or a thread cannot be started. A device that is not plugged in is no error.
 pub fn open(kind: Kind, options: &Options) -> Result<RemoteDevice, DeviceError> {
+    let profile = options.profile.unwrap_or(match kind {
+        Kind::Inverse3 => profiles::INVERSE3,
+        Kind::Touch => profiles::TOUCH,
+        Kind::ForceDimension => profiles::OMEGA,
+    });
     match kind {
-        Kind::Inverse3 => RemoteDevice::start(inverse3::Inverse3::new(options), profiles::INVERSE3, options.mounting),
-        Kind::Touch => RemoteDevice::start(touch::Touch::load(options)?, profiles::TOUCH, options.mounting),
-        Kind::ForceDimension => {
-            let device = forcedimension::ForceDimension::load(options)?;
-            RemoteDevice::start(device, profiles::OMEGA, options.mounting)
-        }
+        Kind::Inverse3 => RemoteDevice::start(inverse3::Inverse3::new(options), profile, options.mounting),
+        Kind::Touch => RemoteDevice::start(touch::Touch::load(options)?, profile, options.mounting),
+        Kind::ForceDimension => RemoteDevice::start(forcedimension::ForceDimension::load(options)?, profile, options.mounting),
     }
 }

@@ -33,6 +33,9 @@ pub const OMEGA: DeviceProfile = DeviceProfile {
     workspace_mm: 75.0,
 };
 
+/// Force Dimension delta.3.
+pub const DELTA: DeviceProfile = DeviceProfile { name: "delta.3", max_force_n: 20.0, mass_kg: 0.2, workspace_mm: 150.0, ..OMEGA };
+
 /// Force Dimension sigma.7, with torque.
 pub const SIGMA: DeviceProfile =
     DeviceProfile { name: "sigma.7", max_torque_n_mm: 200.0, max_stiffness_n_per_mm: 4.0, mass_kg: 0.2, ..OMEGA };
@@ -51,3 +54,31 @@ pub const INVERSE3: DeviceProfile = DeviceProfile {
     delay_s: 0.003,
     workspace_mm: 75.0,
 };
+
+/// All profiles, for scenes that name one.
+pub const ALL: [DeviceProfile; 5] = [TOUCH, OMEGA, DELTA, SIGMA, INVERSE3];
+
+/// The profile of this name.
+pub fn named(name: &str) -> Option<DeviceProfile> {
+    ALL.into_iter().find(|profile| profile.name.eq_ignore_ascii_case(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maille_contact::HapticConfig;
+
+    /// Every profile gives a configuration that its device renders passively, whatever stiffness a scene asks for.
+    #[test]
+    fn every_profile_makes_a_passive_configuration() {
+        for profile in ALL {
+            let (config, _) = HapticConfig::on_device(2.0, 100.0, 5e-4, 1e-3, &profile).unwrap();
+            let (k, b) = (config.coupling.stiffness_n_per_mm(), config.coupling.damping_n_s_per_mm());
+            assert!(profile.damping_n_s_per_mm > k * (0.5e-3 + profile.delay_s) + b, "{}", profile.name);
+            assert!(k > 0.2 && k <= profile.max_stiffness_n_per_mm && config.passivity, "{}: {k} N/mm", profile.name);
+            assert_eq!(config.limits.max_force_n, profile.max_force_n);
+            assert_eq!(named(&profile.name.to_uppercase()), Some(profile));
+        }
+        assert_eq!(named("mouse"), None);
+    }
+}

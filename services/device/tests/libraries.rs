@@ -1,9 +1,10 @@
 //! touch and forcedimension against stand-ins for the vendors' libraries, built here as shared objects: 1 kHz, unplugged and plugged
 //! in again in mid-run, silent ticks, libraries that are missing or lack a function.
 
-use maille_contact::{Device, DeviceStatus};
+use maille_contact::{AnalyticSurface, Device, DeviceStatus, HapticConfig, HapticCore, Material, TickInputs, TissueTable};
 use maille_device::{DeviceError, Kind, Mounting, Options, RemoteDevice, open, probe::probe_kind};
 use maille_realtime::{CountingAllocator, Period, assert_steady, monotonic_ns};
+use maille_volume::VolumeSample;
 use std::{
     path::{Path, PathBuf},
     process::Command,
@@ -40,6 +41,11 @@ impl Mock {
         // SAFETY: the type that the stand-in declares.
         let plug = unsafe { self.0.get::<extern "C" fn(i32)>(b"mock_plug") }.unwrap();
         plug(i32::from(on));
+    }
+    fn place(&self, mm: [f64; 3]) {
+        // SAFETY: the type that the stand-in declares.
+        let place = unsafe { self.0.get::<extern "C" fn(f64, f64, f64)>(b"mock_move") }.unwrap();
+        place(mm[0] * 1e-3, mm[1] * 1e-3, mm[2] * 1e-3);
     }
     fn is_open(&self) -> bool {
         // SAFETY: the type that the stand-in declares.
@@ -142,6 +148,77 @@ fn a_touch_lives_through_unplugging() {
 #[test]
 fn a_force_dimension_device_lives_through_unplugging() {
     lives_through_unplugging(Kind::ForceDimension, "dhd");
+}
+
+/// The whole loop, device to contact to device: pressed on a wall, unplugged in mid-press, plugged in again. The force falls by the slew limit, is not
+/// there while the device is not, and rises from zero.
+#[test]
+fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back() {
+    let path = built("dhd", "contact");
+    let mock = Mock::of(&path);
+    let mut device = open(Kind::ForceDimension, &Options { library: Some(path), ..Options::default() }).unwrap();
+    let (config, _) = HapticConfig::on_device(2.0, 2.0, 5e-4, 1e-3, &device.profile().unwrap()).unwrap();
+    let tissue = TissueTable::uniform(Material { stiffness_n_per_mm: 0.5, friction_static: 0.0, ..Material::SOFT });
+    let mut core = HapticCore::new(HapticConfig { tissue, ..config });
+    let field = |at: [f64; 3]| VolumeSample { value: -100.0 * at[2], gradient: [0.0, 0.0, -100.0] };
+    let wall = AnalyticSurface { field, threshold: 0.0, resolution_mm: 1.0 };
+    let (mut period, mut last, mut n) = (Period::new(1000.0), 0.0f64, 0u64);
+    let mut tick = |device: &mut RemoteDevice, core: &mut HapticCore, steepest: f64| {
+        period.wait();
+        let out = assert_steady(|| {
+            let pose = device.read(0);
+            if let Some(q) = device.orientation() {
+                core.set_orientation(q);
+            }
+            n += 1;
+            let out = core.tick(&TickInputs {
+                now_ns: n * 1_000_000,
+                pose,
+                pose_age_s: device.pose_age_s(),
+                tissue: Some(&wall),
+                epoch: 0,
+                tissue_age_s: 0.0,
+                release: false,
+            });
+            device.write_wrench(out.force_n, out.torque_n_mm);
+            out
+        });
+        let f = out.force_n[2];
+        assert!((0.0..=12.0).contains(&f) && (f - last).abs() <= steepest, "{last} → {f}");
+        last = f;
+        f
+    };
+    // down to the wall, 2 mm deep: some 1 N
+    for k in 0..1500 {
+        mock.place([0.0, 0.0, 6.0 - 0.006 * f64::from(k.min(1000))]);
+        tick(&mut device, &mut core, 0.1 + 1e-9);
+    }
+    // on a busy machine a pose may be late now and then, and the force fades for a while: wait until it rests
+    let (mut pressed, mut resting) = (0.0, 0);
+    for _ in 0..5000 {
+        let f = tick(&mut device, &mut core, 0.1 + 1e-9);
+        resting = if f > 0.5 && (f - pressed).abs() < 1e-6 { resting + 1 } else { 0 };
+        pressed = f;
+        if resting > 100 {
+            break;
+        }
+    }
+    assert!(resting > 100, "{pressed}");
+    mock.plug(false);
+    for _ in 0..600 {
+        tick(&mut device, &mut core, 0.1 + 1e-9);
+    }
+    assert_eq!(tick(&mut device, &mut core, 0.1 + 1e-9), 0.0, "no device, no force");
+    mock.plug(true);
+    let mut back = 0.0;
+    for _ in 0..5000 {
+        back = tick(&mut device, &mut core, 0.1 + 1e-9);
+        if (back - pressed).abs() < 0.05 {
+            break;
+        }
+    }
+    assert!((back - pressed).abs() < 0.05, "{back} of {pressed}");
+    assert!(mock.force()[2] > 0.5 * pressed);
 }
 
 #[test]

@@ -4,8 +4,8 @@
 use std::ffi::{c_char, c_double, c_int, c_uchar, c_uint};
 use std::sync::Mutex;
 
-struct State { plugged: bool, open: bool, enabled: bool, wrench: [f64; 6], watchdog: u8 }
-static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enabled: false, wrench: [0.0; 6], watchdog: 0 });
+struct State { plugged: bool, open: bool, enabled: bool, wrench: [f64; 6], watchdog: u8, position: [f64; 3] }
+static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enabled: false, wrench: [0.0; 6], watchdog: 0, position: [0.01, 0.02, 0.03] });
 
 fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 } else { -1 } }
 
@@ -16,7 +16,8 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdClose(_id: c_char) -> c_int { STATE.lock().unwrap().open = false; 0 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetPosition(x: *mut c_double, y: *mut c_double, z: *mut c_double, id: c_char) -> c_int {
-    unsafe { *x = 0.01; *y = 0.02; *z = 0.03 };
+    let p = STATE.lock().unwrap().position;
+    unsafe { (*x, *y, *z) = (p[0], p[1], p[2]) };
     if id == 3 { there() } else { -1 }
 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetLinearVelocity(x: *mut c_double, y: *mut c_double, z: *mut c_double, _id: c_char) -> c_int {
@@ -40,3 +41,7 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
 #[unsafe(no_mangle)] pub extern "C" fn mock_plug(on: c_int) { STATE.lock().unwrap().plugged = on != 0; }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) { for n in 0..3 { unsafe { *to.add(n) = STATE.lock().unwrap().wrench[n] } } }
 #[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { c_int::from(STATE.lock().unwrap().open) }
+#[unsafe(no_mangle)]
+pub extern "C" fn mock_move(x: c_double, y: c_double, z: c_double) {
+    STATE.lock().unwrap().position = [x, y, z];
+}
