@@ -6,7 +6,7 @@
 //!
 //! Before criterion's own figures the bench prints tables. Times of one thread are that thread's processor time, the best of runs made by
 //! turns: other programs on the machine do not count in them, whichever side they would have hit. Times of several threads are wall
-//! time, best and median. A hash of the voxels tells that the result stayed the same. `RAYON_NUM_THREADS` sets the threads.
+//! time, best and median, with the processor time of all threads beside. A hash of the voxels tells that the result stayed the same. `RAYON_NUM_THREADS` sets the threads.
 
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use maille_chainmail::{Admission, ChainMail, LinkModel, Metric, Motion, Pin, PushOutcome, RelaxOptions, Tissue, reference::Thesis};
@@ -102,6 +102,12 @@ fn thread_ms() -> f64 {
     1e3 * now.tv_sec as f64 + 1e-6 * now.tv_nsec as f64
 }
 
+/// Processor time of all threads [ms].
+fn process_ms() -> f64 {
+    let now = clock_gettime(ClockId::ProcessCPUTime);
+    1e3 * now.tv_sec as f64 + 1e-6 * now.tv_nsec as f64
+}
+
 /// Figure 6.2, ours and the thesis's by turns on one thread.
 fn print_figure_6_2(runs: usize) {
     println!("figure 6.2 of the thesis, one thread, processor time [ms], best of {runs}");
@@ -156,17 +162,18 @@ fn print_figure_6_2(runs: usize) {
 }
 
 fn print_case(name: &str, case: &mut Case, runs: usize) {
-    let (mut deform, mut map, mut both, mut moved) = (Vec::new(), Vec::new(), Vec::new(), 0);
+    let (mut deform, mut map, mut both, mut used, mut moved) = (Vec::new(), Vec::new(), Vec::new(), Vec::new(), 0);
     let ms = |start: Instant| 1e3 * start.elapsed().as_secs_f64();
     for _ in 0..runs {
         case.reset();
-        let start = Instant::now();
+        let (start, used_before) = (Instant::now(), process_ms());
         let outcome = case.deform();
         deform.push(ms(start));
-        let middle = Instant::now();
+        let (middle, used_between) = (Instant::now(), process_ms());
         case.map(&outcome);
         map.push(ms(middle));
         both.push(ms(start));
+        used.push([used_between - used_before, process_ms() - used_between]);
         moved = outcome.moved;
     }
     let hash = case.deformed.to_volume().voxels.iter().fold(0u64, |h, &v| h.wrapping_mul(31).wrapping_add(v as u64));
@@ -174,12 +181,16 @@ fn print_case(name: &str, case: &mut Case, runs: usize) {
     for times in [&mut deform, &mut map, &mut both] {
         times.sort_by(f64::total_cmp);
     }
+    let used = used.iter().fold([f64::INFINITY; 2], |m, u| [m[0].min(u[0]), m[1].min(u[1])]);
     println!(
-        "{name}: {moved} elements, {threads} threads, wall time: best {:.1} + {:.1}, together {:.1} ms; median together {:.1} ms; voxels {hash:016x}",
+        "{name}: {moved} elements, {threads} threads, wall time: best {:.1} + {:.1}, together {:.1} ms; median together {:.1} ms; processor time of all \
+         threads, best {:.1} + {:.1} ms; voxels {hash:016x}",
         deform[0],
         map[0],
         both[0],
-        both[both.len() / 2]
+        both[both.len() / 2],
+        used[0],
+        used[1]
     );
 }
 

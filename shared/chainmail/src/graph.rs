@@ -16,6 +16,9 @@ use maille_volume::{BrickSource, brick::EDGE};
 /// Most neighbours an element has.
 pub const MOST: usize = 26;
 
+/// The steps with at least two components, as numbered in [`Rules::lengths`].
+const DIAGONALS: [usize; 20] = [0, 1, 2, 3, 5, 6, 7, 8, 9, 11, 15, 17, 18, 19, 20, 21, 23, 24, 25, 26];
+
 /// A neighbour: its voxel, slot and offset in the brick, and the limit of the link [mm].
 #[derive(Clone, Copy, Default)]
 pub struct Neighbour {
@@ -78,6 +81,20 @@ fn diagonals<S: BrickSource + ?Sized>(
     voxel: [usize; 3],
     out: &mut [Neighbour],
 ) -> usize {
+    let (slot, at) = place(elements, rest, model, voxel);
+    let inside = voxel.iter().all(|v| (1..EDGE - 1).contains(&(v % EDGE)));
+    let mut count = 0;
+    // most elements lie inside a brick that holds together
+    if inside && elements.limits(slot).whole {
+        let offset = &elements.limits(slot).offset;
+        for n in DIAGONALS {
+            let to = at + (n / 9) * EDGE * EDGE + (n / 3 % 3) * EDGE + n % 3 - (EDGE * EDGE + EDGE + 1);
+            let other = [voxel[0] + n % 3 - 1, voxel[1] + n / 3 % 3 - 1, voxel[2] + n / 9 - 1];
+            out[count] = Neighbour { voxel: other, slot, at: to, limit: link_limit(offset[at], offset[to], rules.lengths[n]) };
+            count += 1;
+        }
+        return count;
+    }
     let size = elements.layout().size;
     // all around once: voxel, place, offset and flags; 0 down, 1 none, 2 up, by axis
     let mut around = [None; 27];
@@ -90,31 +107,25 @@ fn diagonals<S: BrickSource + ?Sized>(
         }
     }
     let thin = SLENDER.iter().fold(0, |a, b| a | b);
-    let mut count = 0;
-    for (n, there) in around.iter().enumerate() {
+    let whole = around.iter().flatten().all(|(_, place, _)| elements.limits(place.0).whole);
+    for n in DIAGONALS {
+        let Some((other, place, (offset, _))) = around[n] else { continue };
         let towards = [n % 3, n / 3 % 3, n / 9];
-        let Some((other, place, (offset, _))) = *there else { continue };
-        if towards.iter().filter(|&&t| t != 1).count() < 2 {
-            continue;
-        }
-        let (mut low, mut length2) = ([1; 3], 0.0f32);
-        for c in (0..3).filter(|&c| towards[c] != 1) {
-            low[c] = towards[c] / 2;
-            length2 += rules.side(2 * c + towards[c] / 2).length.powi(2);
-        }
-        let holds = (0..8usize).all(|m| {
-            let corner = [m & 1, m >> 1 & 1, m >> 2];
-            if (0..3).any(|c| corner[c] == 1 && towards[c] == 1) {
-                return true;
-            }
-            let at: [usize; 3] = std::array::from_fn(|c| low[c] + corner[c]);
-            around[(at[2] * 3 + at[1]) * 3 + at[0]].is_some_and(|(_, _, (offset, flags))| {
-                let cut = (0..3).any(|c| flags & CUT[c] != 0 && corner[c] == 0 && towards[c] != 1);
-                offset.is_finite() && !cut && flags & thin == 0
-            })
-        });
+        let low = towards.map(|t| if t == 1 { 1 } else { t / 2 });
+        let holds = whole
+            || (0..8usize).all(|m| {
+                let corner = [m & 1, m >> 1 & 1, m >> 2];
+                if (0..3).any(|c| corner[c] == 1 && towards[c] == 1) {
+                    return true;
+                }
+                let at: [usize; 3] = std::array::from_fn(|c| low[c] + corner[c]);
+                around[(at[2] * 3 + at[1]) * 3 + at[0]].is_some_and(|(_, _, (offset, flags))| {
+                    let cut = (0..3).any(|c| flags & CUT[c] != 0 && corner[c] == 0 && towards[c] != 1);
+                    offset.is_finite() && !cut && flags & thin == 0
+                })
+            });
         if let (true, Some((_, _, (here, _)))) = (holds, around[13]) {
-            out[count] = Neighbour { voxel: other, slot: place.0, at: place.1, limit: link_limit(here, offset, length2.sqrt()) };
+            out[count] = Neighbour { voxel: other, slot: place.0, at: place.1, limit: link_limit(here, offset, rules.lengths[n]) };
             count += 1;
         }
     }

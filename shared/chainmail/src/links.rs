@@ -149,6 +149,8 @@ pub(crate) struct Rules {
     pub up: [Rule; 3],
     /// what p + 1 demands of p
     pub down: [Rule; 3],
+    /// lengths of the steps to all around [mm], by step along i, j, k (0 down, 1 none, 2 up), i fastest
+    pub lengths: [f32; 27],
 }
 
 impl Rules {
@@ -170,7 +172,14 @@ impl Rules {
                 Rule { length: spacing[axis] * factors.extension, void: f32::INFINITY, cut: true, slender: (0, 0.0) }
             }
         };
-        Self { up: std::array::from_fn(|axis| rule(axis, 1.0)), down: std::array::from_fn(|axis| rule(axis, -1.0)) }
+        let up: [Rule; 3] = std::array::from_fn(|axis| rule(axis, 1.0));
+        let down: [Rule; 3] = std::array::from_fn(|axis| rule(axis, -1.0));
+        let lengths = std::array::from_fn(|n| {
+            let step = |axis: usize, to: usize| [down[axis].length, 0.0, up[axis].length][to];
+            let squares = [step(0, n % 3), step(1, n / 3 % 3), step(2, n / 9)].map(|s| s * s);
+            (squares[0] + squares[1] + squares[2]).sqrt()
+        });
+        Self { up, down, lengths }
     }
 
     /// The rule on a side (axis·2, +1 upwards).

@@ -37,7 +37,9 @@ pub enum Order {
 pub enum Moves {
     /// once, as published
     Once,
-    /// until no candidate is left
+    /// as often as a candidate that waits asks for, but who has moved is not made a candidate again
+    AsFound,
+    /// until no candidate is left, whatever moved being queued anew
     UntilEmpty,
 }
 
@@ -175,7 +177,7 @@ impl QueueMail {
                 continue;
             }
             let q = self.step(p, side);
-            if self.moves == Moves::Once && self.moved_in[q] == self.push {
+            if self.moves != Moves::UntilEmpty && self.moved_in[q] == self.push {
                 continue;
             }
             let w = self.limit(p, q, side);

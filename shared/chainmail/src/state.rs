@@ -30,6 +30,8 @@ pub struct LimitsBrick {
     pub least_own_bound: f32,
     /// the offset, where all elements have the same
     pub uniform: Option<f32>,
+    /// no void, no cut, nothing thin or beyond the volume
+    pub whole: bool,
 }
 
 impl LimitsBrick {
@@ -42,6 +44,7 @@ impl LimitsBrick {
             least_bound: f32::INFINITY,
             least_own_bound: f32::INFINITY,
             uniform: None,
+            whole: false,
         })
     }
 
@@ -306,7 +309,7 @@ impl Elements {
         let mut limits = LimitsBrick::beyond();
         limits.offset.fill(offset);
         limits.bound = bound.is_finite().then(|| Box::new([bound; ELEMENTS]));
-        (limits.least_bound, limits.least_own_bound, limits.uniform) = (bound, bound, Some(offset));
+        (limits.least_bound, limits.least_own_bound, limits.uniform, limits.whole) = (bound, bound, Some(offset), offset.is_finite());
         let limits: Arc<LimitsBrick> = Arc::from(limits);
         self.alike = Some(limits.clone());
         Some(limits)
@@ -360,6 +363,7 @@ impl Elements {
             let flags = out.flags.get_or_insert_with(|| Box::new([0; ELEMENTS]));
             flags.iter_mut().zip(cuts).for_each(|(f, c)| *f |= c & 7);
         }
+        out.whole = most.is_finite() && out.flags.is_none() && size == [EDGE; 3];
         out.uniform = (least == most && out.flags.is_none() && !cut).then_some(least);
         Arc::from(out)
     }
