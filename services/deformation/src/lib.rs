@@ -16,9 +16,10 @@ mod restore;
 mod state;
 mod step;
 
+use maille_chainmail::Capsule;
 use maille_contract::control::Counter;
 use maille_contract::messages::TOOL_IN_CONTACT;
-use maille_contract::{Commit, ControlBlock, Role, ToolMove, ViewState};
+use maille_contract::{Commit, Role, ToolMove, ViewState};
 use maille_scene::Scene;
 use maille_store::{Reader, Writer};
 use maille_transport::{Domain, Life, Node, monotonic_ns};
@@ -72,7 +73,12 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
     while life.beat(monotonic_ns()) {
         if let Some((view, generation)) = life.control().view.load::<ViewState>() {
             match view.checked() {
-                Some(view) => engine.set_threshold(view.threshold_hu),
+                Some(view) => {
+                    let now = monotonic_ns();
+                    if let Some(done) = engine.set_threshold(view.threshold_hu, &reader, &mut writer) {
+                        announcer.step(&mut life, &done, now, None);
+                    }
+                }
                 None if generation != refused_view => {
                     refused_view = generation;
                     life.cell().count(Counter::Refused, 1);
@@ -86,10 +92,22 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
         }
         // while too much waits to become visible (a stopped reader holds the slots) the tissue stands; the newest move stays queued
         let due = now.saturating_sub(last_step) >= shortest_ns && writer.has_room();
-        let Some(message) = due.then(|| moves.latest()).flatten() else {
-            if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && !touched(life.control()) {
+        if engine.cuts() && due {
+            if let Some(done) = engine.cut(life.control().held_tool(now).as_ref(), &reader, &mut writer) {
                 last_step = now;
-                if let Some(done) = engine.relax(now, 2 * RELAX_NS, &reader, &mut writer) {
+                announcer.step(&mut life, &done, now, None);
+            }
+            // a blade pushes nothing
+            let _ = moves.latest();
+        }
+        let Some(message) = due.then(|| moves.latest()).flatten() else {
+            let tool = life.control().held_tool(now).filter(|tool| tool.flags & TOOL_IN_CONTACT != 0);
+            let may = engine.respects_tools() || tool.is_none();
+            if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && may {
+                last_step = now;
+                let held: Vec<Capsule> = tool.iter().map(|t| Capsule { a: t.tip_mm, b: t.tip_mm, radius_mm: t.radius_mm }).collect();
+                let stop = || moves.is_waiting();
+                if let Some(done) = engine.relax(now, 2 * RELAX_NS, &held, &stop, &reader, &mut writer) {
                     announcer.step(&mut life, &done, now, None);
                     continue;
                 }
@@ -111,9 +129,4 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
         }
     }
     Ok(())
-}
-
-/// Whether the tool touches tissue: then nothing relaxes. A haptic process that is gone touches nothing.
-fn touched(control: &ControlBlock) -> bool {
-    control.held_tool(monotonic_ns()).is_some_and(|tool| tool.flags & TOOL_IN_CONTACT != 0)
 }

@@ -19,7 +19,7 @@ pub(crate) fn restore(engine: &mut Engine, writer: &Writer) {
     }
     engine.resume();
     if let Some(state) = State::read(writer.state()) {
-        engine.set_threshold(state.threshold_hu);
+        engine.resume_threshold(state.threshold_hu);
         engine.state = state;
     }
 }

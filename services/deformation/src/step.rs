@@ -5,15 +5,19 @@
 //! vector from that intersection to the deepest point, so that after it the tip is outside. Where the search finds nothing
 //! (the tip slid along a wall), the contact's own foot point, normal and depth say the same. The elements that are moved
 //! are those whose tissue now lies at the intersection: its rest position is found by the mapper's inversion.
+//!
+//! What a scene does not call for is not there: no threshold in the links without `object-shape`, no cuts without `cutting`, no plastic
+//! part without `plasticity`.
 
 use crate::state::{State, VERSION};
 use maille_chainmail::{
-    Admission, ChainMail, ChangedRegion, Motion, Pin, Tissue, elements_in_sphere, enclosing_elements, intersection_search,
+    Admission, Capsule, ChainMail, ChangedRegion, LinkModel, Metric, Motion, Pin, PlasticBand, RelaxOptions, Slender, Tissue,
+    elements_in_sphere, enclosing_elements, intersection_search, swept_blade,
 };
-use maille_contract::{Stamp, ToolMove};
+use maille_contract::{Stamp, ToolMove, ToolState};
 use maille_displacement::{along_axes, in_patient};
 use maille_mapper::{BrickSink, MapOptions, Mapper, rest_position};
-use maille_scene::{Pins, Push, Scene};
+use maille_scene::{Pins, Push, Relaxation, Scene, ToolKind};
 use maille_store::{CommitOutcome, Cuts, Plastic, Reader, Transaction, Writer};
 use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
 
@@ -32,9 +36,29 @@ pub(crate) struct Engine {
     map: MapOptions,
     /// keeps its memory from step to step
     mapper: Mapper,
-    /// time constant of relaxation [s], where the scene asks for it
-    relaxation_s: Option<f64>,
+    /// where the scene asks for it
+    relax: Option<Relax>,
+    /// links follow the live threshold
+    object_shape: bool,
+    /// length of the blade's edge [mm], where a blade is held and the scene asks for cutting
+    blade_mm: Option<f64>,
+    /// where the edge was last: tip and tail [mm]; a process that starts anew begins where it first sees it, and so never cuts what it has not
+    /// seen the blade go through
+    edge: Option<[[f64; 3]; 2]>,
 }
+
+/// How tissue goes back.
+enum Relax {
+    /// by a time constant [s]
+    Decay(f64),
+    /// by sweeps
+    Elastic(RelaxOptions),
+}
+
+/// A blade that moved further than this between two looks was not drawn through the tissue: it jumped [mm].
+const BLADE_JUMP_MM: f64 = 20.0;
+/// A blade is looked at again when it has moved this far [mm].
+const BLADE_STEP_MM: f64 = 0.05;
 
 /// Displacements below this come to rest [mm].
 const SNAP_MM: f32 = 1e-3;
@@ -64,11 +88,11 @@ impl BrickSink for Sink<'_, '_> {
 impl Engine {
     pub fn new(scene: &Scene, info: &VolumeInfo) -> Self {
         let d = &scene.deformation;
+        let object_shape = scene.has_effect("object-shape");
         let tissue = Tissue {
             offset: d.offset as f32,
             density_scaling: d.density_scaling,
-            // all links exist: links through tissue only, as the live threshold has it, come with object shape
-            threshold_hu: None,
+            threshold_hu: object_shape.then_some(d.threshold_hu),
             bone_hu: Some(d.bone_hu),
             movement_limit_mm: Some(d.movement_limit_mm as f32),
             admission: match d.push {
@@ -79,8 +103,42 @@ impl Engine {
         let tolerance = (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32;
         let map = MapOptions { tolerance, void_hu: VOID_HU, ..MapOptions::default() };
         let state = State { version: VERSION, threshold_hu: d.threshold_hu, pushes: 0, last_move: Stamp::default(), last_step_ns: 0 };
-        let relaxation_s = scene.has_effect("relaxation").then_some(d.relaxation_s);
-        Self { mail: ChainMail::new(info, tissue), state, pins: d.pins, push_scale: d.push_scale, map, mapper: Mapper::new(), relaxation_s }
+        let relax = scene.has_effect("relaxation").then(|| match d.relaxation {
+            Relaxation::Decay => Relax::Decay(d.relaxation_s),
+            Relaxation::Elastic => Relax::Elastic(RelaxOptions { tools_hold_hu: Some(d.threshold_hu), ..RelaxOptions::default() }),
+        });
+        let mut mail = ChainMail::new(info, tissue);
+        let metric = match d.metric {
+            maille_scene::Metric::Cubic => Metric::Cubic,
+            maille_scene::Metric::Round => Metric::Round,
+        };
+        // a thin bump bends; as far as links that are one-to-one let it
+        let slender = object_shape.then_some(Slender { thickness: 3, offset: 0.33 });
+        mail.set_link_model(LinkModel { metric, slender, ..LinkModel::default() });
+        if scene.has_effect("plasticity") {
+            let band = |t: &maille_scene::Tissue| PlasticBand { from_hu: t.hu[0], fraction: t.plastic as f32 };
+            mail.set_plasticity(scene.tissues.iter().map(band).collect());
+        }
+        let blade = scene.tool.as_ref().filter(|tool| tool.kind == ToolKind::Blade && scene.has_effect("cutting"));
+        Self {
+            mail,
+            state,
+            pins: d.pins,
+            push_scale: d.push_scale,
+            map,
+            mapper: Mapper::new(),
+            relax,
+            object_shape,
+            blade_mm: blade.map(|tool| tool.blade_mm),
+            edge: None,
+        }
+    }
+
+    fn adopt(&mut self, threshold_hu: f64) {
+        self.state.threshold_hu = threshold_hu;
+        if let Some(Relax::Elastic(options)) = &mut self.relax {
+            options.tools_hold_hu = Some(threshold_hu);
+        }
     }
 
     /// What the store shows is what the mail holds: said once after the mail was restored.
@@ -88,9 +146,58 @@ impl Engine {
         self.mapper = Mapper::resume(&self.mail);
     }
 
-    /// Tissue begins at another value from now on.
-    pub fn set_threshold(&mut self, threshold_hu: f64) {
-        self.state.threshold_hu = threshold_hu;
+    /// Goes on with the threshold of the last commit: its links hold already.
+    pub fn resume_threshold(&mut self, threshold_hu: f64) {
+        self.adopt(threshold_hu);
+        if self.object_shape {
+            self.mail.set_tissue(Tissue { threshold_hu: Some(threshold_hu), ..*self.mail.tissue() });
+        }
+    }
+
+    /// Tissue begins at another value from now on. Where links follow the threshold, those that appear are made to hold; what moves by that
+    /// is committed.
+    pub fn set_threshold(&mut self, threshold_hu: f64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        if threshold_hu == self.state.threshold_hu {
+            return None;
+        }
+        self.adopt(threshold_hu);
+        if !self.object_shape {
+            return None;
+        }
+        let region = self.mail.set_threshold(&reader.rest(), Some(threshold_hu));
+        (!region.is_empty()).then(|| self.commit(&region, reader, writer))
+    }
+
+    /// Cuts the links that the blade has swept through since it was last looked at; nobody holds it: it is out.
+    pub fn cut(&mut self, tool: Option<&ToolState>, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let length = self.blade_mm?;
+        let Some(tool) = tool else {
+            self.edge = None;
+            return None;
+        };
+        let edge = [tool.tip_mm, std::array::from_fn(|c| tool.tip_mm[c] - length * tool.direction[c])];
+        let distance = |a: [f64; 3], b: [f64; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>().sqrt();
+        let before = self.edge.replace(edge)?;
+        let moved = distance(before[0], edge[0]).max(distance(before[1], edge[1]));
+        if moved < BLADE_STEP_MM {
+            self.edge = Some(before);
+            return None;
+        }
+        if moved > BLADE_JUMP_MM {
+            return None;
+        }
+        self.sweep(before, edge, reader, writer)
+    }
+
+    /// Cuts what an edge sweeps through from one place (tip, tail) to another [mm].
+    pub fn sweep(&mut self, before: [[f64; 3]; 2], after: [[f64; 3]; 2], reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let region = self.mail.cut_triangles(&reader.rest(), &swept_blade(before, after));
+        (!region.is_empty()).then(|| self.commit(&region, reader, writer))
+    }
+
+    /// Whether the tool cuts: then it does not push.
+    pub fn cuts(&self) -> bool {
+        self.blade_mm.is_some()
     }
 
     /// Whether this very move was answered, perhaps by a predecessor that died after its commit.
@@ -123,15 +230,31 @@ impl Engine {
 
     /// Whether the scene asks for relaxation.
     pub fn relaxes(&self) -> bool {
-        self.relaxation_s.is_some()
+        self.relax.is_some()
     }
 
-    /// Lets tissue creep towards rest from the last step to `now_ns`, at most for `longest_ns`; `None` when it is there.
-    pub fn relax(&mut self, now_ns: u64, longest_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+    /// Whether tools hold relaxing tissue back, so that it may relax while they touch.
+    pub fn respects_tools(&self) -> bool {
+        matches!(self.relax, Some(Relax::Elastic(_)))
+    }
+
+    /// Lets tissue creep towards rest from the last step to `now_ns`, at most for `longest_ns`; `None` when it is there. `tools` hold back
+    /// tissue that relaxes elastically; `stop` ends a batch early.
+    pub fn relax(
+        &mut self,
+        now_ns: u64,
+        longest_ns: u64,
+        tools: &[Capsule],
+        stop: &dyn Fn() -> bool,
+        reader: &Reader,
+        writer: &mut Writer,
+    ) -> Option<Done> {
         let dt_s = now_ns.saturating_sub(self.state.last_step_ns).min(longest_ns) as f64 * 1e-9;
         self.state.last_step_ns = now_ns;
-        let keep = (-dt_s / self.relaxation_s?).exp() as f32;
-        let region = self.mail.relax(keep, SNAP_MM);
+        let region = match self.relax.as_ref()? {
+            Relax::Decay(time_s) => self.mail.relax((-dt_s / time_s).exp() as f32, SNAP_MM),
+            Relax::Elastic(options) => self.mail.relax_elastic(&reader.rest(), options, tools, stop).region,
+        };
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))
     }
 

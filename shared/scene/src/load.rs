@@ -9,7 +9,7 @@ use crate::{
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, Scene, Size},
     suggest,
-    tool::{Approach, Device, PathPoint},
+    tool::{Approach, Device, PathPoint, ToolKind},
 };
 use serde::Deserialize;
 use std::{
@@ -267,6 +267,10 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let message = format!("bone_hu = {} is not above threshold_hu = {}", scene.deformation.bone_hu, scene.deformation.threshold_hu);
         faults.push(document.fault("deformation.bone_hu", message, "below the threshold", help));
     }
+    if scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Blade) && !scene.has_effect("cutting") {
+        let help = Some("set `cutting = true` under [effects], or hold another tool".into());
+        faults.push(document.fault("tool.kind", "a blade is good for nothing without the effect `cutting`", "needs an effect", help));
+    }
     if scene.volume.file.is_some() && scene.volume.phantom.is_some() {
         let help = Some("keep `file` for a patient of your own, or `phantom` for a made one".into());
         faults.push(document.fault("volume.phantom", "[volume] names both a file and a phantom", "one of them too many", help));
@@ -362,6 +366,7 @@ fn check_tissues(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         check_range(document, &at("stiffness_n_per_mm"), row.stiffness_n_per_mm, [0.0, 50.0], "N/mm", faults);
         check_range(document, &at("stiffening_n_per_mm2"), row.stiffening_n_per_mm2, [0.0, 50.0], "N/mm²", faults);
         check_range(document, &at("damping_n_s_per_mm"), row.damping_n_s_per_mm, [0.0, 1.0], "N·s/mm", faults);
+        check_range(document, &at("plastic"), row.plastic, [0.0, 1.0], "", faults);
         check_range(document, &at("friction_kinetic"), row.friction_kinetic, [0.0, 2.0], "", faults);
         check_range(document, &at("friction_static"), row.friction_static, [row.friction_kinetic, 2.0], "", faults);
     }

@@ -227,8 +227,27 @@ pub static EFFECTS: &[Effect] = &[
         hard_cases: &["a push in the middle of it", "links of any stiffness", "restart half-way"],
         ..Effect::named("relaxation", "tissue creeps back towards rest while no tool touches it")
     },
-    Effect::later("object-shape", "separate pieces collide instead of being linked", &["deformation"]),
-    Effect { channels: &[&CUTS], ..Effect::later("cutting", "links are removed by a blade", &["deformation"]) },
+    Effect {
+        processes: &[Process::Deformation],
+        channels: &[&PLASTIC],
+        depends_on: &["relaxation"],
+        hard_cases: &["restart half-way", "pushed back and forth"],
+        ..Effect::named("plasticity", "a part of each displacement stays, by tissue; with `deformation.relaxation = \"elastic\"`")
+    },
+    Effect {
+        processes: &[Process::Deformation],
+        depends_on: &["deformation"],
+        hard_cases: &["a threshold changed while tissue is deformed", "thin walls", "a void that closes"],
+        ..Effect::named("object-shape", "links run through tissue only, as the live threshold has it; voids close until their walls touch")
+    },
+    Effect {
+        processes: &[Process::Deformation],
+        channels: &[&CUTS],
+        stages: &[stage(Process::Deformation, "cut", Per::Step)],
+        depends_on: &["deformation"],
+        hard_cases: &["a blade that jumps", "cut again where it was cut", "restart half-way"],
+        ..Effect::named("cutting", "a blade (`tool.kind = \"blade\"`) removes the links that it sweeps through")
+    },
     Effect::later("palpation", "several proxies feel a finger's area", &["contact"]),
     Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),

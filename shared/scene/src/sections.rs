@@ -27,6 +27,28 @@ pub enum Pins {
     Sphere,
 }
 
+/// How displacements go back under the effect `relaxation`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Relaxation {
+    /// all by the same factor, within a time constant
+    #[default]
+    Decay,
+    /// by steps that lower the elastic energy; tools hold tissue back, plastic parts stay
+    Elastic,
+}
+
+/// Shape of the regions in which neighbours may move.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Metric {
+    /// six neighbours: square dents, fast
+    #[default]
+    Cubic,
+    /// diagonal neighbours too: rounder dents, slower
+    Round,
+}
+
 /// `[deformation]`: ChainMail and the mapper.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -41,7 +63,11 @@ pub struct Deformation {
     pub bone_hu: f64,
     /// no element moves further than this [mm], 0.1 to 100
     pub movement_limit_mm: f64,
-    /// time constant with which displacements decay under the effect `relaxation` [s], 0.05 to 600
+    /// shape of the regions in which neighbours may move
+    pub metric: Metric,
+    /// how displacements go back under the effect `relaxation`
+    pub relaxation: Relaxation,
+    /// time constant of `relaxation = "decay"` [s], 0.05 to 600
     pub relaxation_s: f64,
     /// how an inadmissible push is made admissible
     pub push: Push,
@@ -66,6 +92,8 @@ impl Default for Deformation {
             threshold_hu: -300.0,
             bone_hu: 300.0,
             movement_limit_mm: 20.0,
+            metric: Metric::Cubic,
+            relaxation: Relaxation::Decay,
             relaxation_s: 0.6,
             push: Push::Clamp,
             pins: Pins::Enclosing,

@@ -29,6 +29,9 @@ pub struct Tissue {
     /// Coulomb friction coefficient in motion, 0 to 2
     #[serde(default)]
     pub friction_kinetic: f64,
+    /// part of a displacement that stays, under the effect `plasticity`, 0 to 1
+    #[serde(default)]
+    pub plastic: f64,
 }
 
 /// Air, fat, soft tissue, bone.
@@ -41,6 +44,7 @@ pub fn defaults() -> Vec<Tissue> {
         damping_n_s_per_mm: laws[2],
         friction_static: laws[3],
         friction_kinetic: laws[4],
+        plastic: 0.0,
     };
     vec![
         row("air", [-5000.0, -300.0], [0.0; 5]),

@@ -16,6 +16,8 @@ pub enum ToolKind {
     Endoscope,
     /// a blunt probe: the same sphere, no camera
     Probe,
+    /// a blade, for the effect `cutting`: a straight edge from the tip along the shaft; it cuts where it goes and pushes nothing
+    Blade,
 }
 
 /// What moves the tool; a string in the scene and on the command line.
@@ -77,6 +79,8 @@ pub struct Tool {
     pub kind: ToolKind,
     /// radius of the spherical tip [mm], 0.1 to 20
     pub radius_mm: f64,
+    /// length of a blade's edge [mm], 1 to 100
+    pub blade_mm: f64,
     /// what moves it
     pub device: Device,
     /// start again at the end of the path
@@ -104,6 +108,7 @@ impl Default for Tool {
         Self {
             kind: ToolKind::Endoscope,
             radius_mm: 2.0,
+            blade_mm: 10.0,
             device: Device::Path,
             looped: true,
             period_s: None,

@@ -262,6 +262,11 @@ impl<T: Message> Subscriber<T> {
         self.port.receive().ok().flatten().map(|sample| *sample)
     }
 
+    /// Whether a message waits.
+    pub fn is_waiting(&self) -> bool {
+        self.port.has_samples().unwrap_or(false)
+    }
+
     /// The newest message; older ones are dropped.
     pub fn latest(&self) -> Option<T> {
         let mut last = None;
