@@ -51,6 +51,15 @@ impl Random {
     }
 }
 
+/// Says that something is over, whatever way it ends: a thread that waits for it would outlive a test that fails.
+struct SetOnDrop<'a>(&'a AtomicBool);
+
+impl Drop for SetOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Relaxed);
+    }
+}
+
 /// Everything that a snapshot shows, in one number.
 fn fingerprint(snapshot: &Snapshot<'_>) -> u64 {
     let mut hash = 0xCBF2_9CE4_8422_2325u64;
@@ -185,6 +194,7 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
     let (stop, mut back, mut kills) = (AtomicBool::new(false), Vec::new(), BTreeMap::new());
     let mut stops = 0;
     let (looks, epochs) = std::thread::scope(|scope| {
+        let _ended = SetOnDrop(&stop);
         let watching = scope.spawn(|| witness(&others, &stop));
         for n in 0..faults {
             // long enough for a service to have started well: five early deaths in ten seconds would end the run, rightly

@@ -10,7 +10,7 @@
 //! fault_injection hand -- --nocapture` for the figures of the README.
 
 use super::{
-    SERVICES, SMALL_SCENE, Scratch,
+    SERVICES, SMALL_SCENE, Scratch, SetOnDrop,
     device::{Felt, RATE_HZ, WATCHDOG_NS, drive, norm, steps},
     fingerprint, number, pid, ready,
     support::{PATIENCE, Run, eventually, left_over, signal},
@@ -79,6 +79,8 @@ fn a_hand_feels_no_step_when_a_service_dies_and_nothing_of_the_tissue_changes() 
 
     let stop = AtomicBool::new(false);
     let (felt, done) = std::thread::scope(|scope| {
+        // a test that fails in here must end its device too
+        let _ended = SetOnDrop(&stop);
         let device = scope.spawn(|| drive(&control, &way, Grip::FULL, &stop));
         until("tissue gives way to the hand", &run, || reader.epoch() > 2);
         let done: Vec<Kill> = (0..kills).map(|n| kill(&run, &control, &reader, SERVICES[n as usize % 3], n)).collect();
