@@ -1,0 +1,201 @@
+//! One field for a moment, and its inverse, kept and renewed from moment to moment.
+//!
+//! u = Σ c_k·B_k at the nodes, i16 with one scale; then v at the same nodes, x + v(x) = X with X + u(X) = x, by `maille-displacement`'s row kernel
+//! from the last moment's v (breathing is smooth in time), line by line, in parallel. Nodes that the row
+//! kernel gives up go through damped Newton; those that fail as well keep their best X and are counted.
+//!
+//! Both in index units of the grid, error of storage half a step: (longest u)/32 767/2. Memory: 8 + 8 + 8 bytes a node.
+//! Whoever wants u or X at few points takes [`super::MotionAt`] instead: it collapses nothing.
+
+use super::at::Shape;
+use super::{MotionModel, Weights};
+use maille_displacement::{DisplacementField, FieldSample, Inverter, RowField, Scheme};
+use maille_volume::VectorField;
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use wide::f32x4;
+
+/// A motion at one moment, at the nodes of its grid.
+#[derive(Clone, Debug)]
+pub struct Collapsed {
+    shape: Shape,
+    size: [usize; 3],
+    forward: Vec<[i16; 4]>,
+    forward_scale: f32,
+    inverse: Vec<[i16; 4]>,
+    inverse_scale: f32,
+    inverter: Inverter,
+    warm: bool,
+}
+
+/// What an update found.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CollapseReport {
+    /// evaluations of u, all nodes together
+    pub evaluations: u64,
+    /// nodes that took damped Newton
+    pub hard: usize,
+    /// nodes at which no rest position was found to the tolerance
+    pub unsettled: usize,
+}
+
+/// Nodes inverted at once.
+const ROW: usize = 32;
+
+impl Collapsed {
+    /// Memory for a model; residuals of the inverse to `tolerance_mm`.
+    pub fn new(model: &MotionModel, tolerance_mm: f32) -> Self {
+        let spacing = model.grid.spacing.map(|s| s as f32);
+        let smallest = model.grid.min_spacing() as f32;
+        let inverter = Inverter {
+            scheme: Scheme::FixedPoint,
+            tolerance: tolerance_mm / smallest,
+            contraction: 0.5,
+            weight: [1.0; 3],
+            max_iterations: 60,
+        };
+        Self {
+            shape: Shape::new(&model.grid),
+            size: model.grid.size,
+            forward: Vec::new(),
+            forward_scale: 1.0,
+            inverse: vec![[0; 4]; model.grid.voxel_count()],
+            inverse_scale: 1.0,
+            inverter: inverter.on_spacing(spacing),
+            warm: false,
+        }
+    }
+
+    /// Goes to another moment: u, then its inverse.
+    pub fn update(&mut self, model: &MotionModel, weights: &Weights) -> CollapseReport {
+        self.collapse(model, weights);
+        self.invert()
+    }
+
+    /// u alone.
+    pub fn collapse(&mut self, model: &MotionModel, weights: &Weights) {
+        // a bound on the longest component, so that nothing saturates
+        let smallest = model.grid.min_spacing() as f32;
+        let longest: f32 = weights.iter().map(|(k, c)| c.abs() * model.fields[k].longest_mm()).sum::<f32>() / smallest;
+        self.forward_scale = (longest / 32_000.0).max(1e-30);
+        self.forward.resize(model.grid.voxel_count(), [0; 4]);
+        let to_steps = f32x4::splat(1.0 / self.forward_scale);
+        const RUN: usize = 1 << 12;
+        self.forward.par_chunks_mut(RUN).enumerate().for_each(|(run, out)| {
+            let mut sum = [f32x4::ZERO; RUN];
+            let sum = &mut sum[..out.len()];
+            for (k, c) in weights.iter() {
+                model.fields[k].add_to(run * RUN, c, sum);
+            }
+            out.iter_mut().zip(sum).for_each(|(o, u)| *o = steps(*u * to_steps));
+        });
+    }
+
+    fn invert(&mut self) -> CollapseReport {
+        let (old_scale, scale) = (self.inverse_scale, self.forward_scale);
+        // v is as long as the longest u; a v that would not fit into 16 bits belongs to no u
+        self.inverse_scale = scale;
+        let field = Nodes { shape: &self.shape, nodes: &self.forward, scale };
+        let (inverter, warm, size) = (&self.inverter, self.warm, self.size);
+        let slow = Inverter { scheme: Scheme::Newton, contraction: 0.0, ..*inverter };
+        let report = self
+            .inverse
+            .par_chunks_mut(size[0])
+            .enumerate()
+            .map(|(line, out)| {
+                let (j, k) = ((line % size[1]) as f32, (line / size[1]) as f32);
+                let mut report = CollapseReport::default();
+                for (block, out) in out.chunks_mut(ROW).enumerate() {
+                    let target: [f32x4; ROW] = std::array::from_fn(|n| f32x4::new([(block * ROW + n) as f32, j, k, 0.0]));
+                    let mut position = target;
+                    for (n, v) in out.iter().enumerate() {
+                        position[n] += if warm { numbers(*v) * old_scale } else { f32x4::ZERO };
+                    }
+                    let mut converged = [false; ROW];
+                    report.evaluations += u64::from(inverter.invert_row(&field, &target, 0..out.len(), &mut position, &mut converged));
+                    for (n, out) in out.iter_mut().enumerate() {
+                        if !converged[n] {
+                            let lanes = |v: f32x4| -> [f32; 3] { std::array::from_fn(|c| v.to_array()[c]) };
+                            let found = slow.invert(&field, lanes(target[n]), lanes(target[n]));
+                            report.hard += 1;
+                            report.evaluations += u64::from(found.iterations);
+                            report.unsettled += usize::from(!found.converged);
+                            position[n] = f32x4::new([found.position[0], found.position[1], found.position[2], 0.0]);
+                        }
+                        *out = steps((position[n] - target[n]) * (1.0 / scale));
+                    }
+                }
+                report
+            })
+            .reduce(CollapseReport::default, |a, b| CollapseReport {
+                evaluations: a.evaluations + b.evaluations,
+                hard: a.hard + b.hard,
+                unsettled: a.unsettled + b.unsettled,
+            });
+        self.warm = true;
+        report
+    }
+
+    /// Error of u or v from 16 bits, at most [voxels].
+    pub fn storage_error(&self) -> f32 {
+        0.5 * self.forward_scale.max(self.inverse_scale)
+    }
+
+    /// u and v as vectors [mm, LPS] on the model's grid.
+    pub fn fields(&self, model: &MotionModel) -> [VectorField; 2] {
+        let mm = |nodes: &[[i16; 4]], scale: f32| {
+            let vector = |n: &[i16; 4]| {
+                let [x, y, z, _] = n.map(|c| f64::from(c) * f64::from(scale));
+                (model.mm_from_index * Vector3::new(x, y, z)).map(|c| c as f32).into()
+            };
+            VectorField { grid: model.grid.clone(), vectors: nodes.par_iter().map(vector).collect() }
+        };
+        [mm(&self.forward, self.forward_scale), mm(&self.inverse, self.inverse_scale)]
+    }
+
+    /// The inverse at a continuous index: reference index X = x + v(x), trilinear in v.
+    #[inline]
+    pub fn reference_index(&self, index: [f32; 3]) -> [f32; 3] {
+        let x = f32x4::new([index[0], index[1], index[2], 0.0]);
+        let [i, j, k, _] = (x + Nodes { shape: &self.shape, nodes: &self.inverse, scale: self.inverse_scale }.value(x)).to_array();
+        [i, j, k]
+    }
+}
+
+/// A field of steps, sampled.
+struct Nodes<'a> {
+    shape: &'a Shape,
+    nodes: &'a [[i16; 4]],
+    scale: f32,
+}
+
+#[inline(always)]
+fn numbers(node: [i16; 4]) -> f32x4 {
+    f32x4::new(node.map(f32::from))
+}
+
+#[inline(always)]
+fn steps(v: f32x4) -> [i16; 4] {
+    // `as` saturates, and takes NaN for 0
+    v.to_array().map(|c| (c + 0.5f32.copysign(c)) as i16)
+}
+
+impl RowField for Nodes<'_> {
+    #[inline]
+    fn value(&self, index: f32x4) -> f32x4 {
+        self.shape.blend(&self.shape.cell(index), |at| numbers(self.nodes[at])) * self.scale
+    }
+    #[inline]
+    fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]) {
+        let (u, slopes) = self.shape.blend_jet(&self.shape.cell(index), |at| numbers(self.nodes[at]));
+        (u * self.scale, slopes.map(|s| s * self.scale))
+    }
+}
+
+impl DisplacementField for Nodes<'_> {
+    fn at(&self, index: [f32; 3]) -> FieldSample {
+        let (u, slopes) = self.jet(f32x4::new([index[0], index[1], index[2], 0.0]));
+        let (u, s) = (u.to_array(), slopes.map(f32x4::to_array));
+        FieldSample { u: [u[0], u[1], u[2]], jacobian: std::array::from_fn(|c| std::array::from_fn(|d| s[d][c])) }
+    }
+}

@@ -1,0 +1,185 @@
+//! A recording as it was measured: times, values, and how many rows were no measurement.
+//!
+//! Rows are dropped, and counted, that say nothing (empty, not a number, all zeros, time not increasing) or that jump further than the
+//! patient can move: a value may leave the last good one by at most `JUMP` times the 90th percentile of the recording's speed, times
+//! the time between them, and the quartiles of the recording by `REACH` times their distance. So a spike, or a sensor that falls far off
+//! and comes back, is a gap.
+//!
+//! Units: seconds from the first good sample; values in the file's unit (mm for markers and RPM).
+//! Not here: what fills the gaps (`super::recorded`).
+
+use thiserror::Error;
+
+/// Why a recording was refused.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum SignalError {
+    /// a line that is neither a sample nor a known sort of dropout
+    #[error("{file}:{line}: {fault}")]
+    Line {
+        /// name of the file
+        file: String,
+        /// counted from 1
+        line: usize,
+        /// what is wrong and what to do
+        fault: String,
+    },
+    /// the whole of it
+    #[error("{file}: {fault}")]
+    File {
+        /// name of the file
+        file: String,
+        /// what is wrong and what to do
+        fault: String,
+    },
+}
+
+impl SignalError {
+    pub(super) fn line(file: &str, line: usize, fault: impl Into<String>) -> Self {
+        Self::Line { file: file.into(), line, fault: fault.into() }
+    }
+    pub(super) fn file(file: &str, fault: impl Into<String>) -> Self {
+        Self::File { file: file.into(), fault: fault.into() }
+    }
+}
+
+/// A recording.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trace {
+    /// name that errors show
+    pub name: String,
+    /// seconds from the first good sample, increasing
+    pub times_s: Vec<f64>,
+    /// one value a time, in the file's unit
+    pub values: Vec<f64>,
+    /// rows that held no measurement
+    pub dropped_rows: usize,
+    /// rows whose value was out of reach of its neighbours
+    pub outlier_rows: usize,
+    /// rows that the recorder itself marked as irregular breathing (kept)
+    pub irregular_rows: usize,
+}
+
+/// How many times the usual highest speed a marker may move before it is an outlier.
+const JUMP: f64 = 6.0;
+/// How many times the distance of the quartiles a value may lie beyond them.
+const REACH: f64 = 3.0;
+/// A recording shorter than this many good samples says nothing of breathing.
+const FEWEST: usize = 16;
+
+impl Trace {
+    /// A recording from numbers: sorts nothing, drops what is not finite, not later than the row before, or out of reach.
+    ///
+    /// # Errors
+    /// One sentence when too little is left.
+    pub fn new(name: &str, rows: impl IntoIterator<Item = (f64, f64)>) -> Result<Self, SignalError> {
+        let mut trace = Self { name: name.into(), times_s: vec![], values: vec![], dropped_rows: 0, outlier_rows: 0, irregular_rows: 0 };
+        for (time, value) in rows {
+            if time.is_finite() && value.is_finite() && trace.times_s.last().is_none_or(|&last| time > last) {
+                trace.times_s.push(time);
+                trace.values.push(value);
+            } else {
+                trace.dropped_rows += 1;
+            }
+        }
+        trace.drop_outliers();
+        if trace.times_s.len() < FEWEST {
+            let fault =
+                format!("{} usable samples ({} rows dropped); at least {FEWEST} are needed", trace.times_s.len(), trace.dropped_rows);
+            return Err(SignalError::file(name, fault));
+        }
+        let first = trace.times_s[0];
+        trace.times_s.iter_mut().for_each(|t| *t -= first);
+        Ok(trace)
+    }
+
+    /// Reads a trace of either format, told by its first line.
+    ///
+    /// # Errors
+    /// As [`Trace::from_vxp`] and [`Trace::from_csv`].
+    pub fn from_text(text: &str, name: &str, options: &super::CsvOptions) -> Result<Self, SignalError> {
+        let vxp = text.trim_start_matches('\u{feff}').lines().map(str::trim).find(|l| !l.is_empty()).is_some_and(|l| l.starts_with('['));
+        if vxp { Self::from_vxp(text, name) } else { Self::from_csv(text, name, options) }
+    }
+
+    /// Seconds from the first to the last good sample.
+    pub fn duration_s(&self) -> f64 {
+        self.times_s.last().copied().unwrap_or(0.0)
+    }
+
+    /// Median time between samples [s].
+    pub fn period_s(&self) -> f64 {
+        quantile(self.times_s.windows(2).map(|w| w[1] - w[0]).collect(), 0.5)
+    }
+
+    /// Stretches longer than `longest_s` without a sample: (start, length) [s].
+    pub fn gaps(&self, longest_s: f64) -> Vec<(f64, f64)> {
+        self.times_s.windows(2).filter(|w| w[1] - w[0] > longest_s).map(|w| (w[0], w[1] - w[0])).collect()
+    }
+
+    fn drop_outliers(&mut self) {
+        let speeds: Vec<f64> =
+            self.times_s.windows(2).zip(self.values.windows(2)).map(|(t, v)| (v[1] - v[0]).abs() / (t[1] - t[0])).collect();
+        let (low, high) = (quantile(self.values.clone(), 0.25), quantile(self.values.clone(), 0.75));
+        let beyond = REACH * (high - low);
+        let (low, high) = (low - beyond, high + beyond);
+        // a quantised or still signal has speed 0 at most samples: then its range a second is what it may do
+        let fastest = JUMP * quantile(speeds, 0.9).max(beyond / REACH);
+        let mut last: Option<(f64, f64)> = None;
+        let kept: Vec<bool> = (0..self.times_s.len())
+            .map(|n| {
+                let (t, v) = (self.times_s[n], self.values[n]);
+                let good = (low..=high).contains(&v) && last.is_none_or(|(t0, v0)| (v - v0).abs() <= fastest * (t - t0));
+                if good {
+                    last = Some((t, v));
+                }
+                good
+            })
+            .collect();
+        self.outlier_rows += kept.iter().filter(|k| !**k).count();
+        let keep = |values: &mut Vec<f64>| {
+            let mut at = kept.iter();
+            values.retain(|_| *at.next().unwrap_or(&false));
+        };
+        keep(&mut self.times_s);
+        keep(&mut self.values);
+    }
+}
+
+/// Value below which a share of the numbers lies; 0 for none.
+pub(super) fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+    values.retain(|v| v.is_finite());
+    if values.is_empty() {
+        return 0.0;
+    }
+    values.sort_by(f64::total_cmp);
+    values[((values.len() - 1) as f64 * share).round() as usize]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wave(t: f64) -> f64 {
+        50.0 + 4.0 * (t * 1.5).sin()
+    }
+
+    #[test]
+    fn a_sensor_that_falls_to_zero_is_a_gap_and_not_a_value() {
+        let rows = (0..400).map(|n| {
+            let t = f64::from(n) * 0.1;
+            (t, if (100..130).contains(&n) || n == 200 { 0.0 } else { wave(t) })
+        });
+        let trace = Trace::new("wave", rows).unwrap();
+        assert_eq!((trace.outlier_rows, trace.dropped_rows), (31, 0));
+        assert_eq!(trace.gaps(0.15).len(), 2);
+        assert!(trace.values.iter().all(|v| (46.0..=54.0).contains(v)));
+    }
+
+    #[test]
+    fn what_is_not_finite_or_not_later_is_dropped() {
+        let rows = [(0.0, 1.0), (f64::NAN, 1.0), (0.0, 2.0)].into_iter().chain((1..40).map(|n| (f64::from(n), 1.0 + f64::from(n % 3))));
+        let trace = Trace::new("t", rows).unwrap();
+        assert_eq!((trace.times_s.len(), trace.dropped_rows), (40, 2));
+        assert!(Trace::new("short", [(0.0, 1.0)]).unwrap_err().to_string().contains("short: 1 usable samples"));
+    }
+}
