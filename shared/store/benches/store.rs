@@ -39,11 +39,15 @@ fn percentiles(mut times: Vec<u64>) -> String {
 
 /// `snapshot()` while another thread commits one brick after the other. Some samples meet a cache line that the writer has just taken (the
 /// head after a commit, the pin after the writer looked at it): how many and how long they are is what p99 is made of.
-fn beside_a_restless_writer(writer: &mut Writer, reader: &Reader) {
+/// `every_commit`: the writer looks at the pins in each commit, not in batches.
+fn beside_a_restless_writer(writer: &mut Writer, reader: &Reader, every_commit: bool) {
     let (stop, commits) = (AtomicBool::new(false), AtomicU64::new(0));
     std::thread::scope(|scope| {
         scope.spawn(|| {
             for round in 0u32.. {
+                if every_commit {
+                    writer.reclaim();
+                }
                 let mut t = writer.begin();
                 t.brick_mut(round % 4096).voxels[0] = round as i16;
                 t.commit();
@@ -53,7 +57,7 @@ fn beside_a_restless_writer(writer: &mut Writer, reader: &Reader) {
                 }
             }
         });
-        for _ in 0..5 {
+        for _ in 0..2 {
             let from = (commits.load(Relaxed), monotonic_ns());
             let times: Vec<u64> = (0..1_000_000)
                 .map(|_| {
@@ -66,7 +70,7 @@ fn beside_a_restless_writer(writer: &mut Writer, reader: &Reader) {
             let above = |ns: u64| times.iter().filter(|&&t| t > ns).count() as f64 * 1e-4;
             let above = [100, 200, 400, 1000].map(above);
             println!(
-                "beside a restless writer (a commit every {every_ns} ns): above 100, 200, 400, 1000 ns: {above:.3?} %; {}",
+                "beside a restless writer (a commit every {every_ns} ns, pins looked at every time: {every_commit}): above 100, 200, 400, 1000 ns: {above:.3?} %; {}",
                 percentiles(times)
             );
         }
@@ -125,7 +129,9 @@ fn store(c: &mut Criterion) {
     };
     println!("snapshot(), clock included: {}", percentiles((0..200_000).map(single).collect()));
     group.bench_function("snapshot", |b| b.iter(|| black_box(reader.snapshot().epoch())));
-    beside_a_restless_writer(&mut writer, &reader);
+    for every_commit in [true, false, true, false] {
+        beside_a_restless_writer(&mut writer, &reader, every_commit);
+    }
     drop(writer);
     group.bench_function("recover", |b| {
         b.iter_batched(|| (), |()| Writer::open(&domain).expect("the store opens"), BatchSize::PerIteration)
