@@ -31,6 +31,7 @@ use crate::{
 };
 use maille_volume::{Brick, BrickId, BrickSource, brick::EDGE};
 use rayon::prelude::*;
+use std::sync::{Mutex, PoisonError};
 
 /// Choices of relaxation.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -104,6 +105,13 @@ struct Tile {
     plain: bool,
 }
 
+impl Tile {
+    fn new() -> Box<Self> {
+        let (u, r) = ([[0.0; TILE]; 3], [[0.0; TILE]; 3]);
+        Box::new(Self { u, r, offset: [f32::MAX; TILE], flags: [0; TILE], plastic: false, plain: false })
+    }
+}
+
 #[inline(always)]
 const fn at(i: usize, j: usize, k: usize) -> usize {
     (k * T + j) * T + i
@@ -120,6 +128,8 @@ struct Sweep<'a> {
     options: &'a RelaxOptions,
     /// in mm along the grid's axes
     tools: &'a [Capsule],
+    /// working memory, taken and put back
+    tiles: &'a Mutex<Vec<Box<Tile>>>,
 }
 
 impl ChainMail {
@@ -223,6 +233,7 @@ impl ChainMail {
             }
         }
         let parity = |id: BrickId| layout.coordinates(id).iter().fold(0, |p, c| 2 * p + c % 2);
+        let tiles = &Mutex::new(Vec::new());
         let mut moved = false;
         for colour in 0..8 {
             let slots: Vec<usize> = active.iter().filter(|&&id| parity(id) == colour).filter_map(|&id| self.elements.slot(id)).collect();
@@ -233,7 +244,7 @@ impl ChainMail {
                 let (elements, model) = (&self.elements, &self.model);
                 let spacing = elements.spacing();
                 let rules = std::array::from_fn(|c| Rules::new(&model.links, spacing, c, 1.0));
-                let sweep = Sweep { model, rules, spacing, options, tools };
+                let sweep = Sweep { model, rules, spacing, options, tools, tiles };
                 let results: Vec<Option<Box<DisplacementBrick>>> = if part.len() > 1 {
                     part.par_iter().map(|&slot| sweep.brick(rest, elements, slot)).collect()
                 } else {
@@ -295,7 +306,8 @@ impl Sweep<'_> {
         if (0..3).all(at_rest) {
             return None;
         }
-        let mut tile = self.gather(elements, brick.id);
+        let mut tile = self.tiles.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_else(Tile::new);
+        self.gather(&mut tile, elements, brick.id);
         let limits = elements.limits(slot);
         let first = elements.layout().first_voxel(brick.id);
         let tools: Vec<&Capsule> = self.tools.iter().filter(|t| self.may_touch(t, brick, first)).collect();
@@ -358,7 +370,7 @@ impl Sweep<'_> {
                 }
             }
         }
-        moved.then(|| {
+        let out = moved.then(|| {
             let mut out: Box<DisplacementBrick> = Box::new(bytemuck::Zeroable::zeroed());
             for (to, from) in out.u.iter_mut().zip(&tile.u) {
                 for (row, to) in to.as_chunks_mut::<EDGE>().0.iter_mut().enumerate() {
@@ -366,7 +378,9 @@ impl Sweep<'_> {
                 }
             }
             out
-        })
+        });
+        self.tiles.lock().unwrap_or_else(PoisonError::into_inner).push(tile);
+        out
     }
 
     /// How far u at `t` may exceed u at `other`, and fall below it.
@@ -416,15 +430,14 @@ impl Sweep<'_> {
     }
 
     /// Copies a brick and one layer of what surrounds it.
-    fn gather(&self, elements: &Elements, id: BrickId) -> Box<Tile> {
-        let mut tile: Box<Tile> = Box::new(Tile {
-            u: [[0.0; TILE]; 3],
-            r: [[0.0; TILE]; 3],
-            offset: [f32::MAX; TILE],
-            flags: [0; TILE],
-            plastic: false,
-            plain: self.model.links.is_plain(),
-        });
+    fn gather(&self, tile: &mut Tile, elements: &Elements, id: BrickId) {
+        // beyond the volume nothing is copied: such links hold nothing, whatever displacement was there before
+        tile.offset.fill(f32::MAX);
+        tile.flags.fill(0);
+        if std::mem::take(&mut tile.plastic) {
+            tile.r = [[0.0; TILE]; 3];
+        }
+        tile.plain = self.model.links.is_plain();
         let (layout, here) = (elements.layout(), elements.layout().coordinates(id));
         let mut voids = false;
         for n in 0..27usize {
@@ -458,7 +471,6 @@ impl Sweep<'_> {
             }
         }
         tile.plain &= !voids;
-        tile
     }
 
     /// Whether elements of a brick, where they are or were, may touch a tool.
