@@ -9,7 +9,7 @@
 //! where e is known to ±Δ/2 only, and better after a step of one Δ: the border between both readings has then just been crossed, and dead
 //! reckoning goes on from there. The middle term is taken at the best guess of e, less a doubt: the least of all the largest errors, and four standard
 //! deviations plus three tenths of all the largest errors (rounding in a repeated motion may repeat). So rounding does not pass for stored
-//! energy: measured, the observer is never over the truth by more than 0.1 mJ (`tests/passivity.rs`).
+//! energy: measured, the observer is hardly ever over the truth by more than 0.1 mJ, and never by 0.4 mJ (`tests/passivity.rs`).
 //!
 //! **Controller.** The force is held for a tick, and d ticks of motion are not seen yet. What F_{n−d} … F_n may give out until t_{n+1} is
 //! foreseen with the least mass m of device and hand: the velocity (`velocity`, and half of its largest error) goes on, quickened by the
