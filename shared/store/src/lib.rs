@@ -17,7 +17,7 @@
 //!
 //! # The protocol's one race, and why it is none
 //! A reader chooses an epoch while the writer decides what nobody sees any more. The module `protocol` holds these steps and the
-//! argument; `tests/model.rs` checks them under loom, `tests/kills.rs` with processes that die in the middle of them.
+//! argument; `tests/model.rs` checks them under loom, `tests/kills/` with processes that die in the middle of them.
 //!
 //! # Layout
 //! Segments (DESIGN D12): the index, rest bricks, brick versions, state, and one for each channel that the plan asks for
