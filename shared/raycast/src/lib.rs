@@ -16,6 +16,7 @@
 
 #![deny(unsafe_code)]
 
+pub mod budget;
 pub mod camera;
 mod frame;
 pub mod labels;
@@ -33,11 +34,12 @@ pub mod transfer;
 mod walk;
 pub mod warp;
 
+pub use budget::{FrameBudget, Quality};
 pub use camera::Camera;
 pub use labels::Labels;
 pub use picture::Picture;
 pub use render::{Extras, Kernel, RenderError, render, render_extra, render_with};
-pub use section::{Plane, Section, section};
+pub use section::{Overlay, Plane, Section, SlabMode, section, section_with};
 pub use settings::{Adaptive, Light, Mode, Settings, Shading, Step};
 pub use skip::{Skip, SkipUpdate};
 pub use transfer::{Preset, Transfer, TransferError};

@@ -4,7 +4,11 @@
 //! left, anterior up), coronal from the front (right on the left, head up), sagittal from the left (anterior on the left,
 //! head up). One pixel is equally many millimetres across and down; outside the volume the picture is black.
 
-use crate::picture::Picture;
+use crate::{
+    labels::{Labels, hsv},
+    picture::Picture,
+    warp::Warp,
+};
 use maille_volume::{BrickSource, Sampler, VolumeInfo};
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -49,6 +53,26 @@ impl Plane {
     }
 }
 
+/// How the values across a slab become one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SlabMode {
+    /// their mean: less noise
+    Mean,
+    /// the largest: vessels, nodules, bone
+    Maximum,
+}
+
+/// What is drawn over the grey of a section, and through which displacement.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Overlay<'a> {
+    /// sections of the patient as moved: positions go back to rest by it
+    pub warp: Option<&'a Warp>,
+    /// colours of organs, at the middle of a slab
+    pub labels: Option<&'a Labels>,
+    /// displacement of the warp in the plane: hue is its direction, this length [mm] is opaque [Fortmeier et al. 2015, figure 10]
+    pub displacement_mm: Option<f64>,
+}
+
 /// A section to be drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Section {
@@ -62,6 +86,10 @@ pub struct Section {
     pub level: f64,
     /// range of values from black to white (HU)
     pub window: f64,
+    /// thickness [mm], 0 for a plane, and what becomes of the values across it
+    pub slab_mm: f64,
+    /// see `slab_mm`
+    pub slab_mode: SlabMode,
 }
 
 impl Section {
@@ -83,7 +111,7 @@ impl Section {
         });
         // one pixel more than the outermost centres, so that they are seen
         let mm_per_pixel = (extent[0] / (width.max(2) - 1) as f64).max(extent[1] / (height.max(2) - 1) as f64);
-        Self { plane, center, mm_per_pixel: mm_per_pixel.max(1e-6), level: 40.0, window: 400.0 }
+        Self { plane, center, mm_per_pixel: mm_per_pixel.max(1e-6), level: 40.0, window: 400.0, slab_mm: 0.0, slab_mode: SlabMode::Mean }
     }
 
     /// Patient position of a pixel's centre [mm, LPS].
@@ -97,19 +125,63 @@ impl Section {
 
 /// Draws a section on the current rayon pool; numbers that are not finite give black.
 pub fn section(source: &(impl BrickSource + ?Sized), section: &Section, picture: &mut Picture) {
+    section_with(source, section, &Overlay::default(), picture);
+}
+
+/// [`section`] of a moved patient and with colours; a warp or labels of another volume are left out.
+pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, overlay: &Overlay<'_>, picture: &mut Picture) {
     let (width, height) = (picture.width, picture.height);
     if width == 0 {
         return;
     }
-    let sampler = Sampler::new(source);
+    let (sampler, grid) = (Sampler::new(source), &source.info().grid);
+    let warp = overlay.warp.filter(|w| w.suits(source.info()));
+    let labels = overlay.labels.filter(|l| l.size() == grid.size);
+    let [right, down] = section.plane.axes().map(Vector3::from);
+    let normal = right.cross(&down);
+    // as many planes as lie half a voxel apart
+    let planes = if section.slab_mm > 0.0 { ((2.0 * section.slab_mm / grid.min_spacing()).ceil() as usize).clamp(1, 512) + 1 } else { 1 };
+    let rest = |at: [f64; 3]| match warp {
+        Some(warp) => warp.rest_index(grid.index_from_world(at).map(|v| v as f32)).map(f64::from),
+        None => grid.index_from_world(at),
+    };
+    let value = |middle: Vector3<f64>| {
+        let (mut sum, mut most, mut count) = (0.0, f64::NEG_INFINITY, 0.0);
+        for n in 0..planes {
+            let t = if planes > 1 { n as f64 / (planes - 1) as f64 - 0.5 } else { 0.0 };
+            let at = (middle + normal * (t * section.slab_mm)).into();
+            // straight there when nothing moves
+            let at = if warp.is_some() { grid.world_from_index(rest(at)) } else { at };
+            if let Some(hu) = sampler.value(at) {
+                (sum, most, count) = (sum + hu, f64::max(most, hu), count + 1.0);
+            }
+        }
+        (count > 0.0).then_some(if section.slab_mode == SlabMode::Mean { sum / count } else { most })
+    };
     let gain = 255.0 / section.window.max(1e-9);
+    let tint = |color: [f32; 3], share: f32, pixel: &mut [u8]| {
+        for (byte, c) in pixel.iter_mut().zip(color) {
+            *byte = (f32::from(*byte) + (255.0 * c - f32::from(*byte)) * share.clamp(0.0, 1.0) + 0.5) as u8;
+        }
+    };
     picture.rgb.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
-            let grey = match sampler.value(section.position(x as f64, y as f64, width, height)) {
-                Some(hu) => ((hu - section.level) * gain + 128.0).clamp(0.0, 255.0) as u8,
-                None => 0,
+            let at = section.position(x as f64, y as f64, width, height);
+            let Some(hu) = value(at.into()) else {
+                pixel.fill(0);
+                continue;
             };
-            pixel.fill(grey);
+            pixel.fill(((hu - section.level) * gain + 128.0).clamp(0.0, 255.0) as u8);
+            if let Some(labels) = labels {
+                let [r, g, b, share] = labels.colors[usize::from(labels.at(rest(at)))];
+                tint([r, g, b], 0.5 * share, pixel);
+            }
+            if let (Some(_), Some(opaque_mm)) = (warp, overlay.displacement_mm) {
+                let u = Vector3::from(at) - Vector3::from(grid.world_from_index(rest(at)));
+                let (across, up) = (u.dot(&right), -u.dot(&down));
+                let color = hsv((up.atan2(across) / std::f64::consts::TAU) as f32, 1.0, 1.0);
+                tint(color, (across.hypot(up) / opaque_mm.max(1e-9)) as f32, pixel);
+            }
         }
     });
     if let Some(depth) = &mut picture.depth {

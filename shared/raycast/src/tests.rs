@@ -1,8 +1,8 @@
 //! Properties of pictures: two kernels agree, skipping changes nothing, spheres are where geometry puts them.
 
 use crate::{
-    Adaptive, Camera, Kernel, Light, Mode, Picture, Plane, RenderError, Section, Settings, Shading, Skip, Step, Transfer, frame::Frame,
-    render, render_with, scalar::Caster, section,
+    Adaptive, Camera, Extras, Kernel, Light, Mode, Motion, Picture, Plane, RenderError, Section, Settings, Shading, Skip, SlabMode, Step,
+    Transfer, Warp, WarpOptions, frame::Frame, render, render_extra, render_with, scalar::Caster, section,
 };
 use maille_volume::{BrickId, BrickSource, BrickedVolume, Grid, Rescale, Volume, brick::fill_from_volume};
 
@@ -405,4 +405,115 @@ fn odd_volumes_render_without_panic() {
             assert!(furthest(&fast, &slow) <= KERNELS, "{size:?}");
         }
     }
+}
+
+/// A breathing-like motion: a swelling and a shear that fade towards the border.
+fn breath(x: [f64; 3]) -> [f64; 3] {
+    use maille_testkit::Displacement;
+    let bump = maille_testkit::RadialBump { center: [24.0, 20.0, 20.0], radius: 30.0, magnification: 1.25 };
+    bump.forward(x)
+}
+
+fn breathing(grid: &Grid) -> Motion {
+    let mut field = maille_volume::VectorField::zeros(grid.clone());
+    let [nx, ny, _] = grid.size;
+    for (n, v) in field.vectors.iter_mut().enumerate() {
+        *v = breath(grid.world_from_index([(n % nx) as f64, (n / nx % ny) as f64, (n / (nx * ny)) as f64])).map(|c| c as f32);
+    }
+    // half of it twice: a sum of bases is their sum
+    let mut half = field.clone();
+    half.vectors.iter_mut().flatten().for_each(|c| *c *= 0.5);
+    Motion::new(&[half.clone(), half]).unwrap()
+}
+
+#[test]
+fn a_warp_finds_rest_positions_within_its_bound_warm_or_cold() {
+    use maille_testkit::Displacement;
+    let bump = maille_testkit::RadialBump { center: [24.0, 20.0, 20.0], radius: 30.0, magnification: 1.25 };
+    let volume = clutter([48, 40, 44], [1.0, 1.0, 1.0]);
+    let mut field_grid = Grid::axis_aligned([61, 51, 56], [1.2; 3]);
+    field_grid.origin = [-12.0, -8.0, -9.0];
+    let info = maille_volume::VolumeInfo { grid: Grid::axis_aligned([48, 40, 44], [1.0; 3]), ..volume.info };
+    let motion = breathing(&field_grid);
+    let mut warp = Warp::new(&info, WarpOptions { pitch_mm: 2.0, ..WarpOptions::default() });
+    for coefficients in [[1.0, 1.0], [0.2, 0.3], [1.2, 0.8]] {
+        let report = warp.update(&info, &motion, &coefficients).unwrap();
+        assert_eq!(report.unsettled, 0, "{report:?}");
+        if coefficients[0] + coefficients[1] < 1.9 {
+            continue;
+        }
+        let mut worst = 0.0f64;
+        for n in 0..4000 {
+            let x = [n as f64 * 0.37 % 47.0, n as f64 * 0.91 % 39.0, n as f64 * 0.53 % 43.0];
+            let v = bump.inverse(x);
+            let found = warp.rest_index(x.map(|c| c as f32));
+            worst = worst.max(norm(std::array::from_fn(|c| f64::from(found[c]) - x[c] - v[c])));
+        }
+        // the field's own grid interpolates the formula, which the bound knows nothing of: 1.2² / 8 of its curvature
+        assert!(worst < f64::from(report.error_mm) + 0.02, "{worst} mm, {report:?}");
+        assert!(report.error_mm < 0.2, "{report:?}");
+    }
+    assert!(warp.update(&info, &motion, &[1.0]).is_err());
+    assert!(warp.update(&info, &motion, &[f32::NAN, 1.0]).is_err());
+}
+
+#[test]
+fn a_warped_picture_is_the_picture_of_the_volume_resampled() {
+    let mut grid = Grid::axis_aligned([48, 40, 44], [1.0; 3]);
+    grid.origin = [0.0; 3];
+    // smooth enough that resampling once more hardly blurs it
+    let hu = |x: [f64; 3]| 900.0 * ((x[0] / 7.0).sin() * (x[1] / 8.0).cos() + (x[2] / 6.0).sin()) - 300.0;
+    let source = BrickedVolume::from_volume(&volume(grid.clone(), hu));
+    // nothing crosses the border, which a volume resampled on the same grid could not show
+    let mut field = maille_volume::VectorField::zeros(grid.clone());
+    for (n, v) in field.vectors.iter_mut().enumerate() {
+        let index = [n % 48, n / 48 % 40, n / (48 * 40)];
+        let inner: f64 = (0..3).map(|c| (std::f64::consts::PI * index[c] as f64 / (grid.size[c] - 1) as f64).sin().powi(2)).product();
+        *v = [1.5 * inner as f32, -2.0 * inner as f32, 3.0 * inner as f32];
+    }
+    let motion = Motion::single(&field).unwrap();
+    let mut warp = Warp::new(source.info(), WarpOptions { pitch_mm: 1.0, ..WarpOptions::default() });
+    warp.update(source.info(), &motion, &[1.0]).unwrap();
+    // beyond the volume there is nothing: far below every visible value, as beyond the warped rays' reach
+    let moved = BrickedVolume::from_volume(&volume(grid.clone(), |x| {
+        let rest = warp.rest_index(x.map(|c| c as f32)).map(f64::from);
+        if grid.contains_index(rest) { hu(rest) } else { -1200.0 }
+    }));
+    for (name, settings) in kinds() {
+        // sums of attenuation and cut faces differ where the border itself moves
+        if name == "xray" {
+            continue;
+        }
+        for camera in cameras(&grid) {
+            let skip = Skip::new(&source, &settings);
+            for kernel in [Kernel::Portable, Kernel::Avx2, Kernel::Avx512] {
+                let mut warped = Picture::with_depth(60, 45);
+                let extras = Extras { kernel, warp: Some(&warp), ..Extras::default() };
+                render_extra(&extras, &source, &skip, &camera, &settings, &mut warped).unwrap();
+                let baked = look(&moved, &camera, &settings, kernel, [60, 45]);
+                let mean = |a: &Picture, b: &Picture| {
+                    a.rgb.iter().zip(&b.rgb).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / a.rgb.len() as f64 / 255.0
+                };
+                let difference = mean(&warped, &baked);
+                // rays of a warp begin elsewhere, so that samples lie elsewhere between the same voxels; cut faces move by that, too
+                assert!(difference < 0.01, "{kernel:?} {name}: {difference} of full scale");
+            }
+        }
+    }
+}
+
+#[test]
+fn slabs_take_the_mean_or_the_largest_across_them() {
+    let mut grid = Grid::axis_aligned([32, 32, 32], [1.0; 3]);
+    grid.origin = [-15.5; 3];
+    // values rise with z
+    let source = BrickedVolume::from_volume(&volume(grid, |x| 10.0 * x[2]));
+    let seen = |slab_mm: f64, slab_mode: SlabMode| {
+        let mut picture = Picture::new(9, 9);
+        let whole = Section::whole(source.info(), Plane::Axial, Some(0.0), 9, 9);
+        section(&source, &Section { level: 0.0, window: 255.0, slab_mm, slab_mode, ..whole }, &mut picture);
+        f64::from(picture.pixel(4, 4)[0])
+    };
+    assert!((seen(8.0, SlabMode::Mean) - seen(0.0, SlabMode::Mean)).abs() <= 1.0);
+    assert!((seen(8.0, SlabMode::Maximum) - seen(0.0, SlabMode::Mean) - 40.0).abs() <= 1.0);
 }

@@ -338,6 +338,17 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
             None => self.inverse,
         };
         let d = d.float();
+        let least = self.box_exit(&inverse, d, corner, p);
+        match &self.bend {
+            Some(bend) => bend.way_out(l, q, least, d),
+            None => least,
+        }
+    }
+
+    /// Steps along a straight ray to the end of the box of empty cells, d − 1 cells beyond its cell on every side.
+    #[inline(always)]
+    fn box_exit(&self, inverse: &[L::Float; 3], d: L::Float, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
+        let l = self.l;
         let back = l.set(1.0) - d;
         let mut least = l.set(f32::INFINITY);
         for c in 0..3 {
@@ -345,10 +356,19 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
             let wall = (corner[c] + side) * l.set(CELL as f32);
             least = least.min((wall - p[c]) * inverse[c]);
         }
-        match &self.bend {
-            Some(bend) => bend.way_out(l, q, least, d),
-            None => least,
-        }
+        least
+    }
+
+    /// What the skip map says of the cells around positions, and the cells' numbers by axis.
+    #[inline(always)]
+    fn state(&self, p: &[L::Float; 3], distances: &[u8], counts: [usize; 3], large: bool) -> (L::Int, [L::Float; 3]) {
+        let l = self.l;
+        let base: [L::Int; 3] = axes!(c => p[c].whole().min(l.int(self.frame.last_cell[c])).max(l.int(0)));
+        let cell = axes!(c => divide::<L, CELL>(l, base[c]));
+        let corner = axes!(c => cell[c].float());
+        let number = if large { flat_large(l, &cell, counts) } else { flat(l, &corner, counts) };
+        // SAFETY: a cell of the volume: bases were clamped to it, and the map has a byte for each of its cells and three more.
+        (unsafe { l.bytes(distances, number) }, corner)
     }
 
     /// Walks to the end.
@@ -367,22 +387,35 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
         // the piece of ray that comes next, and whether diffuse and specular are of this stretch of matter
         let (mut from, mut long) = (zero, one);
         let mut shaded = none;
+        // lanes that the warp had out of the volume a moment ago
+        let mut edge = none;
         let mut alive = l.set(0.5).lt(self.rays.length);
         while alive.any() {
             let q = long.fma(l.set(0.5), from);
             alive = alive & !self.rays.length.lt(q);
-            let p = self.bent(q, alive);
+            let (mut far, mut far_out) = (none, zero);
+            let mut fresh = none;
+            if let Some(bend) = &self.bend {
+                // what is empty however the warp moves it is jumped over without asking the warp
+                let p = self.rays.at(q);
+                let (state, corner) = self.state(&p, distances, counts, large);
+                let d = state.float() - l.set(bend.cells());
+                far = alive & one.lt(d) & !state.eq(l.int(i32::from(GENTLE)));
+                if far.any() {
+                    far_out = self.box_exit(&self.inverse, d, &corner, &p);
+                }
+            }
+            let p = self.bent(q, alive & !far);
+            let (state, corner) = self.state(&p, distances, counts, large);
             let place = self.place(&p);
-            let cell = axes!(c => divide::<L, CELL>(l, place.base[c]));
-            let corner = axes!(c => cell[c].float());
-            let number = if large { flat_large(l, &cell, counts) } else { flat(l, &corner, counts) };
-            // SAFETY: a cell of the volume: bases were clamped to it, and the map has a byte for each of its cells and three more.
-            let state = unsafe { l.bytes(distances, number) };
             let mut empty = state.gt(l.int(0)) & !state.eq(l.int(i32::from(GENTLE)));
             let outside = match &self.bend {
                 Some(bend) => {
                     let (outside, jump) = outside_lanes(l, frame, bend, &p);
-                    empty = empty | outside;
+                    // matter met right after what is outside is cut open, as at the start of a ray
+                    fresh = edge & !outside;
+                    edge = outside & !far;
+                    empty = empty | outside | far;
                     Some((outside, jump))
                 }
                 None => None,
@@ -393,7 +426,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
             if (alive & empty).any() {
                 let mut out = self.way_out(q, state, &corner, &p);
                 if let Some((outside, jump)) = outside {
-                    out = out.or(outside, jump);
+                    out = out.or(outside, jump).or(far, far_out);
                 }
                 // as if the ray went on by one step at a time; a hair less, so that rounding carries no sample across a wall
                 let behind = from + long.max(one);
@@ -450,7 +483,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
                     if let Mode::Both { color: surface, .. } = frame.mode
                         && hit.any()
                     {
-                        let (at, factors) = self.surface(q, hit, value);
+                        let (at, factors) = self.surface(q, hit, value, fresh);
                         for c in 0..3 {
                             color[c] = color[c] + (transmittance * l.set(surface[c]).fma(factors[0], factors[1])).only(hit);
                         }
@@ -463,7 +496,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
                     next = next.or(here, from + one);
                     let hit = here & value.ge(l.set(frame.threshold));
                     if hit.any() {
-                        let (at, factors) = self.surface(q, hit, value);
+                        let (at, factors) = self.surface(q, hit, value, fresh);
                         for c in 0..3 {
                             color[c] = color[c] + l.set(surface[c]).fma(factors[0], factors[1]).only(hit);
                         }
@@ -491,10 +524,10 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
 
     /// Distance [mm] and factors of colour and highlight where rays that were found inside matter at q met its surface.
     #[inline(always)]
-    fn surface(&mut self, q: L::Float, hit: L::Mask, value: L::Float) -> (L::Float, [L::Float; 2]) {
+    fn surface(&mut self, q: L::Float, hit: L::Mask, value: L::Float, fresh: L::Mask) -> (L::Float, [L::Float; 2]) {
         let (l, frame) = (self.l, self.frame);
         // matter cut open at the start of the ray faces the light; elsewhere the crossing is found
-        let cut = q.lt(l.set(0.75));
+        let cut = q.lt(l.set(0.75)) | fresh;
         let at = self.refine(q, hit, value).or(cut, q);
         let p = self.bent(at, hit);
         let place = self.place(&p);

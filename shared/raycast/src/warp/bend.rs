@@ -79,26 +79,40 @@ impl<'a> Bend<'a> {
         axes!(c => p[c] + along.fma(l.load(&self.slope[c]), l.load(&self.offset[c])))
     }
 
+    /// Cells by which the warp may move anything.
+    #[inline(always)]
+    pub fn cells(&self) -> f32 {
+        self.warp.cells()
+    }
+
     /// Moves a lane's knots so that q lies between them.
-    #[inline(never)]
+    #[inline(always)]
     fn knot(&mut self, lane: usize, q: f32) {
-        let place = |q: f32| std::array::from_fn(|c| self.delta[c][lane].mul_add(q, self.origin[c][lane]));
-        let (from, offset, reach) = if q < self.until[lane] + self.reach[lane] {
+        let place = |q: f32| [0, 1, 2].map(|c| self.delta[c][lane] * q + self.origin[c][lane]);
+        let contiguous = q < self.until[lane] + self.reach[lane];
+        let (from, until, after, offset, slope, turn);
+        if contiguous {
             let length = self.until[lane] - self.from[lane];
-            let offset = std::array::from_fn(|c| self.slope[c][lane].mul_add(length, self.offset[c][lane]));
-            (self.until[lane], offset, self.reach[lane])
+            from = self.until[lane];
+            until = from + self.reach[lane];
+            offset = [0, 1, 2].map(|c| self.slope[c][lane] * length + self.offset[c][lane]);
+            let next;
+            (next, after, turn) = self.warp.offset_and_turn(place(until));
+            slope = [0, 1, 2].map(|c| (next[c] - offset[c]) / self.reach[lane]);
         } else {
-            let (offset, reach) = self.warp.offset(place(q));
-            (q, offset, reach / self.step)
-        };
-        let until = from + reach;
-        let (next, after, turn) = self.warp.offset_and_turn(place(until));
+            // after a jump: along the tangent, half as far, which errs as much and takes one look
+            let near;
+            (offset, near, turn) = self.warp.offset_and_turn(place(q));
+            from = q;
+            until = q + 0.5 * near / self.step;
+            after = near;
+            slope = self.warp.along(&turn, [0, 1, 2].map(|c| self.delta[c][lane]));
+        }
         (self.from[lane], self.until[lane], self.reach[lane]) = (from, until, after / self.step);
         for c in 0..3 {
             self.offset[c][lane] = offset[c];
-            let slope = (next[c] - offset[c]) / reach;
-            self.slope[c][lane] = slope;
-            let moved = self.delta[c][lane] + slope;
+            self.slope[c][lane] = slope[c];
+            let moved = self.delta[c][lane] + slope[c];
             self.inverse[c][lane] = 1.0 / if moved.abs() < TINY { TINY } else { moved };
         }
         for (row, t) in self.turn.iter_mut().zip(turn) {

@@ -5,7 +5,7 @@
 
 use super::field::{Lazy, Motion, WarpError, Whole};
 use maille_displacement::{Inverter, RowField, Scheme};
-use maille_volume::VolumeInfo;
+use maille_volume::{VolumeInfo, brick::CELL};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use wide::f32x4;
@@ -63,6 +63,10 @@ pub struct Warp {
     origin: [f32; 3],
     /// between nodes [index]
     pitch: [f32; 3],
+    /// its inverse
+    per_pitch: [f32; 3],
+    /// slope of v's component c [index per node] along an axis ↦ derivative in millimetres
+    turn_scale: [[f32; 3]; 3],
     counts: [usize; 3],
     /// v [index]
     nodes: Vec<f32x4>,
@@ -73,6 +77,8 @@ pub struct Warp {
     steepest: [[f32; 3]; 3],
     /// how far matter may leave the volume [index]
     margin: [f32; 3],
+    /// see [`Warp::cells`]
+    cells: f32,
     collapsed: Vec<f32x4>,
     warm: bool,
 }
@@ -86,12 +92,15 @@ impl Warp {
             size: info.grid.size,
             origin: [0.0; 3],
             pitch: [1.0; 3],
+            per_pitch: [1.0; 3],
+            turn_scale: [[1.0; 3]; 3],
             counts: [0; 3],
             nodes: Vec::new(),
             blocks: [0; 3],
             reach: Vec::new(),
             steepest: [[0.0; 3]; 3],
             margin: [0.0; 3],
+            cells: 0.0,
             collapsed: Vec::new(),
             warm: false,
         }
@@ -104,6 +113,18 @@ impl Warp {
 
     pub(super) fn steepest(&self) -> &[[f32; 3]; 3] {
         &self.steepest
+    }
+
+    /// Cells of the skip map by which anything may be moved, rounded up.
+    pub(super) fn cells(&self) -> f32 {
+        self.cells
+    }
+
+    /// Change of v [index] for a step along a ray [index], by a derivative in millimetres.
+    #[inline(always)]
+    pub(super) fn along(&self, turn: &[f32; 9], delta: [f32; 3]) -> [f32; 3] {
+        let mm = [0, 1, 2].map(|d| delta[d] * self.spacing[d]);
+        [0, 1, 2].map(|c| (turn[3 * c] * mm[0] + turn[3 * c + 1] * mm[1] + turn[3 * c + 2] * mm[2]) / self.spacing[c])
     }
 
     /// Whether it was made for a volume of this size and has been updated.
@@ -147,6 +168,8 @@ impl Warp {
         // a quarter more, so that a breath that grows does not start anew each frame
         self.margin = needed.map(|m| (1.25 * m).ceil());
         self.pitch = std::array::from_fn(|c| self.options.pitch_mm / self.spacing[c]);
+        self.per_pitch = self.pitch.map(|p| 1.0 / p);
+        self.turn_scale = std::array::from_fn(|d| std::array::from_fn(|c| self.spacing[c] / (self.pitch[d] * self.spacing[d])));
         self.origin = self.margin.map(|m| -m);
         self.counts = std::array::from_fn(|c| {
             let length = (self.size[c] - 1) as f32 + 2.0 * self.margin[c];
@@ -256,20 +279,21 @@ impl Warp {
         let nodes = &self.nodes;
         let spacing = f32x4::new([self.spacing[0], self.spacing[1], self.spacing[2], 0.0]);
         let pitch_mm: [f32; 3] = std::array::from_fn(|c| self.pitch[c] * self.spacing[c]);
-        // per block: the largest second derivative [1/mm] and slopes [index per index]
-        let found: Vec<(f32, [f32x4; 3])> = (0..bx * by * bz)
+        // per block: the largest second derivative [1/mm], slopes [index per index] and length [index]
+        let found: Vec<(f32, [f32x4; 3], f32x4)> = (0..bx * by * bz)
             .into_par_iter()
             .map(|b| {
                 let first = [b % bx, b / bx % by, b / (bx * by)].map(|c| c * BLOCK);
-                let (mut curve, mut slope) = (f32x4::ZERO, [f32x4::ZERO; 3]);
+                let (mut curve, mut slope, mut length) = (f32x4::ZERO, [f32x4::ZERO; 3], f32x4::ZERO);
                 for k in first[2]..(first[2] + BLOCK).min(nz) {
                     for j in first[1]..(first[1] + BLOCK).min(ny) {
                         for i in first[0]..(first[0] + BLOCK).min(nx) {
                             let n = (k * ny + j) * nx + i;
                             let here = nodes[n];
+                            length = length.fast_max(here.abs());
                             let inner = [i, j, k];
                             let steps = [1, nx, nx * ny];
-                            // Σ_ab |H_ab| d_a d_b ≤ Σ_a |H_aa| + Σ_{a<b} |H_ab| for a unit direction d, since d_a d_b ≤ ½
+                            // |dᵀ H d| ≤ √(Σ_ab H_ab²) for a unit direction d
                             let mut sum = f32x4::ZERO;
                             for a in 0..3 {
                                 if inner[a] + 1 < self.counts[a] {
@@ -277,12 +301,14 @@ impl Warp {
                                     slope[a] = slope[a].fast_max(ahead.abs());
                                     if inner[a] > 0 {
                                         let second = ahead - (here - nodes[n - steps[a]]);
-                                        sum += second.abs() * f32x4::splat(1.0 / (pitch_mm[a] * pitch_mm[a]));
+                                        let h = second * f32x4::splat(1.0 / (pitch_mm[a] * pitch_mm[a]));
+                                        sum += h * h;
                                     }
                                     let b = (a + 1) % 3;
                                     if inner[b] + 1 < self.counts[b] {
                                         let mixed = nodes[n + steps[a] + steps[b]] - nodes[n + steps[b]] - ahead;
-                                        sum += mixed.abs() * f32x4::splat(1.0 / (pitch_mm[a] * pitch_mm[b]));
+                                        let h = mixed * f32x4::splat(1.0 / (pitch_mm[a] * pitch_mm[b]));
+                                        sum += h * h + h * h;
                                     }
                                 }
                             }
@@ -290,12 +316,15 @@ impl Warp {
                         }
                     }
                 }
-                let [x, y, z, _] = (curve * spacing).to_array();
-                ((x * x + y * y + z * z).sqrt(), slope)
+                let [x, y, z, _] = (curve.sqrt() * spacing).to_array();
+                ((x * x + y * y + z * z).sqrt(), slope, length)
             })
             .collect();
+        let longest = found.iter().fold(f32x4::ZERO, |l, f| l.fast_max(f.2)).to_array();
+        // a hair more, for what lies between nodes' rounding
+        self.cells = (longest[0].max(longest[1]).max(longest[2]) * 1.001 / CELL as f32).ceil();
         self.steepest = [[0.0; 3]; 3];
-        for (_, slope) in &found {
+        for (_, slope, _) in &found {
             for (d, slope) in slope.iter().enumerate() {
                 let s = slope.to_array();
                 (0..3).for_each(|c| self.steepest[c][d] = self.steepest[c][d].max(s[c] / self.pitch[d]));
@@ -327,7 +356,7 @@ impl Warp {
     fn locate(&self, at: [f32; 3]) -> (usize, usize, [f32; 3]) {
         let (mut cell, mut fraction) = ([0usize; 3], [0.0; 3]);
         for c in 0..3 {
-            let t = ((at[c] - self.origin[c]) / self.pitch[c]).max(0.0);
+            let t = ((at[c] - self.origin[c]) * self.per_pitch[c]).max(0.0);
             cell[c] = (t as usize).min(self.counts[c] - 2);
             fraction[c] = (t - cell[c] as f32).min(1.0);
         }
@@ -356,8 +385,9 @@ impl Warp {
         let mut turn = [0.0; 9];
         for (axis, slope) in slopes.into_iter().enumerate() {
             let s = slope.to_array();
-            let per_mm = 1.0 / (self.pitch[axis] * self.spacing[axis]);
-            (0..3).for_each(|c| turn[3 * c + axis] = s[c] * self.spacing[c] * per_mm);
+            for c in 0..3 {
+                turn[3 * c + axis] = s[c] * self.turn_scale[axis][c];
+            }
         }
         let [i, j, k, _] = mix(g0, g1, z).to_array();
         ([i, j, k], self.reach[block], turn)
