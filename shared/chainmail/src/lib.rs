@@ -52,6 +52,7 @@ mod relax;
 mod relaxation;
 mod repair;
 mod state;
+mod sweep;
 mod tile;
 mod tissue;
 
