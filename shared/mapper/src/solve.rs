@@ -100,7 +100,7 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             return report;
         }
         // far from every void and cut the map is one piece
-        let all_linked = !voids && !(self.gaps && self.is_cut(range));
+        let all_linked = !(voids || self.gaps && self.is_cut(range));
         let may_fold = !all_linked || self.mail.tissue().offset >= 1.0 / 3.0;
         let (window, found, pieces, left) = (&work.window, &mut *work.found, &mut work.pieces, &mut work.left);
         if all_linked {
