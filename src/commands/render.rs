@@ -3,7 +3,10 @@
 use super::{Failure, Outcome};
 use clap::{Args as ClapArgs, ValueEnum};
 use maille_phantom::{Kind, Phantom};
-use maille_raycast::{Camera, Picture, Plane, Preset, Section, Settings, Skip, Step, Transfer, render, section};
+use maille_raycast::{
+    Camera, Extras, Labels, Light, Overlay, Picture, Plane, Preset, Section, Settings, Skip, SlabMode, Step, Transfer, render_extra,
+    section_with,
+};
 use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
 use maille_volume::{BrickSource as _, BrickedVolume, Volume, io};
 use std::{
@@ -51,6 +54,8 @@ pub struct Args {
     /// show the surface at this value instead of the transfer function
     #[arg(long, value_name = "HU", value_parser = finite, allow_hyphen_values = true)]
     iso: Option<f64>,
+    #[command(flatten)]
+    more: Box<More>,
     /// colours without light
     #[arg(long)]
     no_shade: bool,
@@ -71,6 +76,32 @@ pub struct Args {
     time: Option<usize>,
 }
 
+/// What fewer pictures need.
+#[derive(ClapArgs)]
+struct More {
+    /// with the transfer function, show the opaque surface at this value
+    #[arg(long, value_name = "HU", value_parser = finite, allow_hyphen_values = true, conflicts_with = "iso")]
+    with_surface: Option<f64>,
+    /// samples one step apart, instead of by their weight in the picture
+    #[arg(long)]
+    even: bool,
+    /// a lamp at the eye, as an endoscope has: where half of its light is left
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    lamp: Option<f64>,
+    /// barrel distortion of the lens, 0 for none; 0.3 is much
+    #[arg(long, value_name = "K", value_parser = positive)]
+    barrel: Option<f64>,
+    /// organs on the volume's own grid, in colours: a volume of whole numbers from 0 (nothing) to 255
+    #[arg(long, value_name = "VOLUME")]
+    labels: Option<PathBuf>,
+    /// thickness of a section
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    slab: Option<f64>,
+    /// what a thick section shows of the values across it
+    #[arg(long, value_enum, default_value_t = Slab::Mean)]
+    slab_mode: Slab,
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum View {
     #[value(name = "3d")]
@@ -79,6 +110,12 @@ enum View {
     Coronal,
     Sagittal,
     Xray,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Slab {
+    Mean,
+    Max,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -107,6 +144,7 @@ pub fn run(args: &Args) -> Outcome {
     let sizes = scene.as_ref().map(|s| if plane.is_some() { s.rendering.section_size } else { s.rendering.size });
     let [width, height] = args.size.or(sizes).unwrap_or([1024, 768]);
     let mut picture = Picture::new(width, height);
+    let labels = args.more.labels.as_deref().map(|path| labels(path, &bricks)).transpose()?;
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(args.threads.unwrap_or(0))
         .build()
@@ -115,14 +153,17 @@ pub fn run(args: &Args) -> Outcome {
     let times = match plane {
         Some(plane) => {
             let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
-            timed(frames, || pool.install(|| section(&bricks, &section_of, &mut picture)))
+            let overlay = Overlay { labels: labels.as_ref(), ..Overlay::default() };
+            timed(frames, || pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)))
         }
         None => {
             let settings = settings(args, scene.as_ref())?;
             let camera = camera(args, scene.as_ref(), &bricks)?;
             let skip = pool.install(|| Skip::new(&bricks, &settings));
+            let extras = Extras { labels: labels.as_ref(), barrel: args.more.barrel.unwrap_or(0.0), ..Extras::default() };
             let mut outcome = Ok(());
-            let times = timed(frames, || outcome = pool.install(|| render(&bricks, &skip, &camera, &settings, &mut picture)));
+            let times =
+                timed(frames, || outcome = pool.install(|| render_extra(&extras, &bricks, &skip, &camera, &settings, &mut picture)));
             outcome.map_err(|e| Failure::Refused(format!("{}: {e}", args.input.display())))?;
             times
         }
@@ -174,8 +215,14 @@ fn settings(args: &Args, scene: Option<&Scene>) -> Result<Settings, Failure> {
     let mut settings = match (args.view, iso) {
         (View::Xray, _) => Settings::xray(),
         (_, Some(threshold)) => Settings::isosurface(threshold),
-        _ => Settings::volume(transfer(name)?),
+        _ => match args.more.with_surface {
+            Some(threshold) => Settings::both(transfer(name)?, threshold),
+            None => Settings::volume(transfer(name)?),
+        },
     };
+    if args.more.even {
+        settings.adaptive = None;
+    }
     if let Some(rendering) = rendering {
         settings.step = Step::Voxels(rendering.step);
         settings.opacity_end = rendering.opacity_end;
@@ -186,7 +233,26 @@ fn settings(args: &Args, scene: Option<&Scene>) -> Result<Settings, Failure> {
     if args.no_shade || rendering.is_some_and(|r| !r.shading) {
         settings.shading = None;
     }
+    if let (Some(half_distance_mm), Some(shading)) = (args.more.lamp, &mut settings.shading) {
+        shading.light = Light::AtEye { half_distance_mm };
+    }
     Ok(settings)
+}
+
+/// Labels from a file on the volume's grid.
+fn labels(path: &Path, bricks: &BrickedVolume) -> Result<Labels, Failure> {
+    let fault = |text: String| Failure::Refused(format!("{}: {text}", path.display()));
+    let volume = read(path)?;
+    if volume.info.grid != bricks.info().grid {
+        return Err(fault("the labels are not on the volume's grid".into()));
+    }
+    let rescale = volume.info.rescale;
+    let label = |v: &i16| {
+        let value = rescale.value(f64::from(*v)).round();
+        (0.0..=255.0).contains(&value).then_some(value as u8).ok_or_else(|| fault(format!("{value} is no label from 0 to 255")))
+    };
+    let voxels = volume.voxels.iter().map(label).collect::<Result<_, _>>()?;
+    Labels::new(volume.info.grid.size, voxels).map_err(fault)
 }
 
 /// A preset, or the transfer function in a file.
@@ -241,6 +307,11 @@ fn section_settings(args: &Args, scene: Option<&Scene>, bricks: &BrickedVolume, 
     if let Some([level, window]) = args.window.or(scene.map(|s| s.rendering.section_window_hu)) {
         (section.level, section.window) = (level, window);
     }
+    section.slab_mm = args.more.slab.unwrap_or(0.0);
+    section.slab_mode = match args.more.slab_mode {
+        Slab::Mean => SlabMode::Mean,
+        Slab::Max => SlabMode::Maximum,
+    };
     section
 }
 
@@ -274,6 +345,10 @@ fn finite(text: &str) -> Result<f64, String> {
         Ok(v) if v.is_finite() => Ok(v),
         _ => Err(format!("{text} is not a finite number")),
     }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    finite(text).ok().filter(|v| *v > 0.0).ok_or_else(|| format!("{text} is not a number above 0"))
 }
 
 fn list<const N: usize>(text: &str) -> Result<[f64; N], String> {
