@@ -203,9 +203,15 @@ fn fill(
 ) -> (ChangedBrick, u64) {
     let (mut out, mut count) = (ChangedBrick::new(brick.id), 0);
     let x: [usize; EDGE] = std::array::from_fn(|i| steps(first[0] + i, low[0], high[0]));
-    for k in 0..EDGE {
+    // rows that nothing reaches are not looked at
+    let span = |c: usize| {
+        let reach = octants[largest].extent[c] - 2;
+        let end = |at: usize| at.saturating_sub(first[c]).min(EDGE);
+        end(low[c] - reach)..end(high[c] + reach + 1)
+    };
+    for k in span(2) {
         let z = steps(first[2] + k, low[2], high[2]);
-        for j in 0..EDGE {
+        for j in span(1) {
             let y = steps(first[1] + j, low[1], high[1]);
             let Some(row) = octants[largest].row(y, z).filter(|r| r[0] > 0.0) else { continue };
             let moved = |i: usize| x[i] < row.len() && row[x[i]] > 0.0;
