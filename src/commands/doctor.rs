@@ -1,30 +1,51 @@
 //! `maille doctor`.
 
 use super::{Failure, Outcome};
+use maille_device::Options;
 use maille_supervisor::doctor::{Verdict, examine};
+use serde_json::json;
 
 /// Tell what this machine has and lacks for maille
 ///
-/// Cores, shared memory, real-time rights, runs that live or left something. Exit status 1 only when nothing can run here.
+/// Cores, shared memory, real-time rights, runs that live or left something, haptic devices. Exit status 1 only when nothing can run here.
 #[derive(clap::Args, Default)]
-pub struct Args {}
+pub struct Args {
+    /// print one JSON object: `findings` with subject, verdict (good, note, fatal), found, advice
+    #[arg(long)]
+    json: bool,
+}
 
 /// Runs the command.
-pub fn run(_args: &Args) -> Outcome {
-    let findings = examine();
-    for finding in &findings {
-        let mark = match finding.verdict {
+pub fn run(args: &Args) -> Outcome {
+    let mut rows: Vec<(String, Verdict, String, String)> =
+        examine().into_iter().map(|f| (f.subject.into(), f.verdict, f.found, f.advice)).collect();
+    // no device is no fault: a simulated hand stands in
+    rows.extend(
+        maille_device::probe(&Options::default()).into_iter().map(|f| (f.kind.name().into(), Verdict::Good, f.says, String::new())),
+    );
+    if args.json {
+        let word = |verdict| match verdict {
             Verdict::Good => "good",
             Verdict::Advice => "note",
-            Verdict::Fatal => "FAIL",
+            Verdict::Fatal => "fatal",
         };
-        println!("{mark}  {:<14} {}", finding.subject, finding.found);
-        if !finding.advice.is_empty() {
-            println!("{:<21}→ {}", "", finding.advice);
+        let object = |(subject, verdict, found, advice): &(String, Verdict, String, String)| json!({ "subject": subject, "verdict": word(*verdict), "found": found, "advice": advice });
+        println!("{}", json!({ "findings": rows.iter().map(object).collect::<Vec<_>>() }));
+    } else {
+        for (subject, verdict, found, advice) in &rows {
+            let mark = match verdict {
+                Verdict::Good => "good",
+                Verdict::Advice => "note",
+                Verdict::Fatal => "FAIL",
+            };
+            println!("{mark}  {subject:<14} {found}");
+            if !advice.is_empty() {
+                println!("{:<21}→ {advice}", "");
+            }
         }
     }
-    match findings.iter().find(|f| f.verdict == Verdict::Fatal) {
-        Some(fatal) => Err(Failure::Refused(format!("simulations cannot run here: {} {}", fatal.subject, fatal.found))),
+    match rows.iter().find(|(_, verdict, ..)| *verdict == Verdict::Fatal) {
+        Some((subject, _, found, _)) => Err(Failure::Refused(format!("simulations cannot run here: {subject} {found}"))),
         None => Ok(()),
     }
 }

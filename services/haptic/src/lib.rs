@@ -9,6 +9,7 @@
 
 #![forbid(unsafe_code)]
 
+mod device;
 mod operator;
 mod outbox;
 mod publisher;
@@ -35,6 +36,8 @@ pub enum HapticError {
     Scene(String),
     #[error("this scene has no [tool]: there is nothing for the haptic process to do")]
     NoTool,
+    #[error(transparent)]
+    Device(#[from] maille_device::DeviceError),
     #[error("the thread that publishes poses could not start: {0}")]
     Thread(std::io::Error),
 }

@@ -1,7 +1,7 @@
 //! Who holds the tool: the scene's script, a simulated hand, the page, or a device in another process; and how it passes from one to
 //! the other.
 //!
-//! A device in another process is never taken over by the page: there is a hand on it.
+//! A device in another process, or a real one, is never taken over by the page: there is a hand on it.
 //!
 //! The page takes the tool where it is and drags it through a critically damped follower; when it lets go (or falls silent
 //! for [`SILENT_NS`]), the script takes over from where the tool was left: the offset to the script's way is taken away
@@ -10,6 +10,7 @@
 use maille_contact::{ConsoleDevice, Device as _, DevicePose, Grip, SimulatedHand};
 use maille_contract::ToolCommand;
 use maille_contract::messages::{DEVICE_KNOWS_VELOCITY, DEVICE_VALID, DeviceState};
+use maille_device::RemoteDevice;
 use maille_scene::{Device, Hand, Tool, Waypoints};
 
 /// A page that holds the tool and has not been heard of for this long has let go [ns].
@@ -24,6 +25,8 @@ enum Holder {
     Hand(Box<SimulatedHand>),
     /// a device in another process
     External,
+    /// a device of its own thread in this one
+    Real(Box<RemoteDevice>),
 }
 
 /// Moves the tool.
@@ -39,14 +42,15 @@ pub(crate) struct Operator {
 }
 
 impl Operator {
-    pub fn new(tool: &Tool, way: Waypoints) -> Self {
+    pub fn new(tool: &Tool, way: Waypoints, real: Option<RemoteDevice>) -> Self {
         let start = way.at(0.0);
         let pose = DevicePose { position_mm: start.position_mm, direction: start.direction, velocity_mm_s: None, valid: true };
         let hand = || Box::new(SimulatedHand::new(grip(&tool.hand), start.position_mm, start.direction));
-        let holder = match tool.device {
-            Device::Sim => Holder::Hand(hand()),
-            Device::External => Holder::External,
-            Device::Path | Device::PathFile(_) | Device::Console => Holder::Script,
+        let holder = match (&tool.device, real) {
+            (_, Some(real)) => Holder::Real(Box::new(real)),
+            (Device::Sim, _) => Holder::Hand(hand()),
+            (Device::External, _) => Holder::External,
+            _ => Holder::Script,
         };
         Self { way, holder, page: None, back: None, pose, follow_script: tool.device != Device::Console }
     }
@@ -56,8 +60,31 @@ impl Operator {
         matches!(self.holder, Holder::External)
     }
 
+    /// Orientation of the tool, where a device knows it.
+    pub fn orientation(&self) -> Option<[f64; 4]> {
+        if let Holder::Real(device) = &self.holder { device.orientation() } else { None }
+    }
+
+    /// The pose and its age [s]; see [`Self::read`]. `said` is the word of a device in another process.
+    pub fn sample(
+        &mut self,
+        now_ns: u64,
+        monotonic_ns: u64,
+        command: Option<&ToolCommand>,
+        said: impl FnOnce() -> Option<DeviceState>,
+    ) -> (DevicePose, f64) {
+        match &mut self.holder {
+            Holder::External => self.external(said(), monotonic_ns),
+            Holder::Real(device) => {
+                self.pose = device.read(now_ns);
+                (self.pose, device.pose_age_s())
+            }
+            _ => (self.read(now_ns, monotonic_ns, command), 0.0),
+        }
+    }
+
     /// What a device in another process says, and its age [s]. Invalid while it has said nothing.
-    pub fn external(&mut self, said: Option<DeviceState>, monotonic_ns: u64) -> (DevicePose, f64) {
+    fn external(&mut self, said: Option<DeviceState>, monotonic_ns: u64) -> (DevicePose, f64) {
         let Some(said) = said.and_then(DeviceState::checked) else {
             return (DevicePose { valid: false, ..self.pose }, 0.0);
         };
@@ -116,7 +143,7 @@ impl Operator {
             }
         }
         match &mut self.holder {
-            Holder::Script | Holder::External => {
+            Holder::Script | Holder::External | Holder::Real(_) => {
                 DevicePose { position_mm: target, direction: way.direction, velocity_mm_s: Some(velocity), valid: true }
             }
             Holder::Hand(hand) => {
@@ -126,10 +153,12 @@ impl Operator {
         }
     }
 
-    /// The force on the hand.
-    pub fn write(&mut self, force_n: [f64; 3]) {
-        if let Holder::Hand(hand) = &mut self.holder {
-            hand.write(force_n);
+    /// Force [N] and torque about the handle [N·mm] on the hand.
+    pub fn write(&mut self, force_n: [f64; 3], torque_n_mm: [f64; 3]) {
+        match &mut self.holder {
+            Holder::Hand(hand) => hand.write(force_n),
+            Holder::Real(device) => device.write_wrench(force_n, torque_n_mm),
+            Holder::Script | Holder::External => {}
         }
         if let Some(page) = &mut self.page {
             page.write(force_n);
@@ -150,7 +179,7 @@ mod tests {
     fn operator(device: Device) -> Operator {
         let point = |time_s, x| Waypoint { time_s, position_mm: [x, 0.0, 0.0], direction: [1.0, 0.0, 0.0] };
         let way = Waypoints::new(vec![point(0.0, 0.0), point(1.0, 10.0), point(2.0, 0.0)], true, None).unwrap();
-        Operator::new(&Tool { device, ..Tool::default() }, way)
+        Operator::new(&Tool { device, ..Tool::default() }, way, None)
     }
 
     #[test]

@@ -1,22 +1,38 @@
 //! From the scene's tables to the contact engine's configuration.
 
-use maille_contact::{Coupling, CouplingError, HapticConfig, Limits, Material, TissueTable};
-use maille_scene::{Scene, Tissue, Tool};
+use maille_contact::{Coupling, CouplingError, DeviceProfile, HapticConfig, Limits, Material, TissueTable, ToolShape};
+use maille_scene::{Scene, Shape, Tissue, Tool};
 
 /// Damping of a device of the Touch class [N·s/mm] (5 N·s/m, CHAI3D's table of devices): what the coupling may count on
 /// while no real device says otherwise.
 const DEVICE_DAMPING_N_S_PER_MM: f64 = 0.005;
 
-/// Configuration of the tick, and whether the coupling's gains had to be lowered to stay passive.
-pub(crate) fn config(scene: &Scene, tool: &Tool) -> Result<(HapticConfig, bool), CouplingError> {
+/// Width of an ultrasound probe's face, and radius of its curvature [mm]: a convex probe for the abdomen.
+const PROBE_WIDTH_MM: f64 = 60.0;
+const PROBE_FACE_MM: f64 = 60.0;
+
+/// Configuration of the tick, and whether the coupling's gains had to be lowered to stay passive; on a real device by its profile.
+pub(crate) fn config(scene: &Scene, tool: &Tool, device: Option<&DeviceProfile>) -> Result<(HapticConfig, bool), CouplingError> {
     let h = &scene.haptic;
     let period_s = 1.0 / h.rate_hz;
-    let (coupling, lowered) =
-        Coupling::lowered(h.contact_stiffness_n_per_mm, h.contact_damping_n_s_per_mm, DEVICE_DAMPING_N_S_PER_MM, period_s)?;
-    let mut config = HapticConfig::new(tool.radius_mm, coupling);
+    let (stiffness, damping) = (h.contact_stiffness_n_per_mm, h.contact_damping_n_s_per_mm);
+    let (mut config, lowered) = match device {
+        Some(device) => HapticConfig::on_device(tool.radius_mm, stiffness, damping, period_s, device)?,
+        None => {
+            let (coupling, lowered) = Coupling::lowered(stiffness, damping, DEVICE_DAMPING_N_S_PER_MM, period_s)?;
+            (HapticConfig::new(tool.radius_mm, coupling), lowered)
+        }
+    };
+    config.shape = match tool.shape {
+        Shape::Tip => ToolShape::sphere(tool.radius_mm),
+        Shape::Shaft => ToolShape::capsule(tool.radius_mm, tool.shaft_mm),
+        Shape::Finger => ToolShape::finger(tool.radius_mm),
+        Shape::Probe => ToolShape::probe(PROBE_WIDTH_MM, PROBE_FACE_MM, tool.radius_mm),
+    };
     config.period_s = period_s;
     config.tissue = table(&scene.tissues);
-    config.limits = Limits { max_force_n: h.max_force_n, max_slew_n_per_s: h.max_slew_n_per_s, ramp_s: h.ramp_s, fade_s: h.fade_s };
+    let max_force_n = device.map_or(h.max_force_n, |device| h.max_force_n.min(device.max_force_n));
+    config.limits = Limits { max_force_n, max_slew_n_per_s: h.max_slew_n_per_s, ramp_s: h.ramp_s, fade_s: h.fade_s };
     Ok((config, lowered))
 }
 

@@ -1,6 +1,6 @@
 //! One tick of the loop: sample, compute, hand over. Bounded work, no allocation, nothing that waits.
 
-use crate::{HapticError, operator::Operator, outbox::Outbox, setup};
+use crate::{HapticError, device, operator::Operator, outbox::Outbox, setup};
 use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER};
@@ -32,7 +32,9 @@ impl<'a> Loop<'a> {
     /// Sets the loop up; everything that allocates happens here.
     pub fn new(scene: &Scene, reader: &'a Reader, outbox: Arc<Outbox>, publisher: Thread) -> Result<Self, HapticError> {
         let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
-        let (config, lowered) = setup::config(scene, tool).map_err(|e| HapticError::Scene(e.to_string()))?;
+        let real = device::kind(tool).map(|kind| device::options(scene).map(|options| (kind, options))).transpose()?;
+        let profile = real.as_ref().map(|(kind, options)| maille_device::profile(*kind, options));
+        let (config, lowered) = setup::config(scene, tool, profile.as_ref()).map_err(|e| HapticError::Scene(e.to_string()))?;
         if lowered {
             eprintln!(
                 "maille-haptic: the coupling's gains were lowered to {:.3} N/mm and {:.4} N·s/mm, the most that is passive at this rate",
@@ -44,10 +46,12 @@ impl<'a> Loop<'a> {
         let sampler = Sampler::new(&rest);
         let way =
             scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
+        let way = way.ok_or(HapticError::NoTool)?;
+        let real = real.map(|(kind, options)| device::open(kind, options, &way)).transpose()?;
         Ok(Self {
             reader,
             core: HapticCore::new(config),
-            operator: Operator::new(tool, way.ok_or(HapticError::NoTool)?),
+            operator: Operator::new(tool, way, real),
             threshold_hu: scene.deformation.threshold_hu,
             view_seen: 0,
             command: None,
@@ -74,11 +78,11 @@ impl<'a> Loop<'a> {
         let control = life.control();
         let now_ns = control.time_ns(monotonic_ns);
         self.listen(control);
-        let (pose, pose_age_s) = if self.operator.is_external() {
-            self.operator.external(control.device.load().map(|(said, _)| said), monotonic_ns)
-        } else {
-            (self.operator.read(now_ns, monotonic_ns, self.command.as_ref()), 0.0)
-        };
+        let said = || control.device.load().map(|(said, _)| said);
+        let (pose, pose_age_s) = self.operator.sample(now_ns, monotonic_ns, self.command.as_ref(), said);
+        if let Some(orientation) = self.operator.orientation() {
+            self.core.set_orientation(orientation);
+        }
         let snapshot = self.reader.snapshot();
         let surface = Isosurface::new(&snapshot, self.threshold_hu);
         let epoch = snapshot.epoch();
@@ -86,7 +90,7 @@ impl<'a> Loop<'a> {
         self.degraded = monotonic_ns.saturating_sub(control.service(Role::Deformation).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
         let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
         let out = self.core.tick(&inputs);
-        self.operator.write(out.force_n);
+        self.operator.write(out.force_n, out.torque_n_mm);
         self.ticks += 1;
         if self.operator.is_external() {
             let incarnation = life.incarnation();

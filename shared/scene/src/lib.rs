@@ -32,4 +32,4 @@ pub use resolve::View;
 pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
 pub use sections::{CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering};
 pub use tissue::Tissue;
-pub use tool::{Approach, Device, Hand, PathPoint, Tool, ToolKind};
+pub use tool::{Approach, Device, DeviceSection, Hand, PROFILES, PathPoint, RealDevice, Shape, Tool, ToolKind};

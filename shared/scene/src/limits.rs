@@ -32,8 +32,10 @@ macro_rules! limits {
 #[rustfmt::skip]
 pub static LIMITS: &[Limit] = limits! {
     tool.radius_mm: 0.1 ..= 20 ["mm"] |s| s.tool.as_ref().map(|t| t.radius_mm);
+    tool.shaft_mm: 1 ..= 300 ["mm"] |s| s.tool.as_ref().map(|t| t.shaft_mm);
     tool.blade_mm: 1 ..= 100 ["mm"] |s| s.tool.as_ref().map(|t| t.blade_mm);
     tool.period_s: 0.1 ..= 3600 ["s"] |s| s.tool.as_ref().and_then(|t| t.period_s);
+    device.scale: 0.1 ..= 10 [""] |s| s.device.scale;
     deformation.offset: 0.01 ..= 0.99 [""] |s| Some(s.deformation.offset);
     deformation.threshold_hu: -1024 ..= 3071 ["HU"] |s| Some(s.deformation.threshold_hu);
     deformation.bone_hu: -1024 ..= 32767 ["HU"] |s| Some(s.deformation.bone_hu);

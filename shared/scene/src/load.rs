@@ -9,7 +9,7 @@ use crate::{
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, Scene, Size},
     suggest,
-    tool::{Approach, Device, PathPoint, ToolKind},
+    tool::{Approach, Device, PROFILES, PathPoint, Shape, ToolKind},
 };
 use serde::Deserialize;
 use std::{
@@ -266,6 +266,24 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some("tissue begins at threshold_hu and ends where bone begins: bone_hu must be the larger".into());
         let message = format!("bone_hu = {} is not above threshold_hu = {}", scene.deformation.bone_hu, scene.deformation.threshold_hu);
         faults.push(document.fault("deformation.bone_hu", message, "below the threshold", help));
+    }
+    if let Some(profile) = scene.device.profile.as_ref().filter(|p| !PROFILES.iter().any(|known| known.eq_ignore_ascii_case(p))) {
+        let help = Some(format!("profiles are {}", PROFILES.join(", ")));
+        faults.push(document.fault("device.profile", suggest::unknown("profile", profile, PROFILES), "no such profile", help));
+    }
+    if let Some(r) = scene.device.rotation {
+        let dot = |a: usize, b: usize| (0..3).map(|c| r[a][c] * r[b][c]).sum::<f64>();
+        let orthonormal = |a: usize, b: usize| (dot(a, b) - f64::from(u8::from(a == b))).abs() <= 1e-3;
+        if !(0..9).all(|n| orthonormal(n / 3, n % 3)) {
+            let help =
+                Some("its rows are the patient's axes seen by the device: three unit vectors, each at a right angle to the others".into());
+            faults.push(document.fault("device.rotation", "device.rotation is no rotation", "rows are not orthonormal", help));
+        }
+    }
+    check_finite(document, "device.origin_mm", scene.device.origin_mm, faults);
+    if scene.tool.as_ref().is_some_and(|tool| matches!(tool.shape, Shape::Finger | Shape::Probe)) && !scene.has_effect("palpation") {
+        let help = Some("set `palpation = true` under [effects], or use `shape = \"tip\"`".into());
+        faults.push(document.fault("tool.shape", "a tool with a face needs the effect `palpation`", "needs an effect", help));
     }
     if scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Blade) && !scene.has_effect("cutting") {
         let help = Some("set `cutting = true` under [effects], or hold another tool".into());

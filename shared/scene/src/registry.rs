@@ -248,7 +248,12 @@ pub static EFFECTS: &[Effect] = &[
         hard_cases: &["a blade that jumps", "cut again where it was cut", "restart half-way"],
         ..Effect::named("cutting", "a blade (`tool.kind = \"blade\"`) removes the links that it sweeps through")
     },
-    Effect::later("palpation", "several proxies feel a finger's area", &["contact"]),
+    Effect {
+        processes: &[Process::Haptic],
+        depends_on: &["contact"],
+        hard_cases: &["sliding across commits", "thin walls", "poses that are no numbers"],
+        ..Effect::named("palpation", "a finger or an ultrasound probe (`tool.shape`) feels with several proxies")
+    },
     Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
     Effect::later("breathing", "the patient breathes", &[]),

@@ -3,7 +3,7 @@
 use crate::{
     sections::{Console, Deformation, Haptic, Memory, Rendering},
     tissue::{self, Tissue},
-    tool::Tool,
+    tool::{DeviceSection, Tool},
 };
 use serde::{Deserialize, Serialize};
 use std::{collections::BTreeMap, path::PathBuf};
@@ -132,6 +132,10 @@ impl EffectSetting {
     }
 }
 
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
 /// A scene: everything the supervisor and the services are told.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -147,6 +151,9 @@ pub struct Scene {
     /// what is held and what moves it; none: no haptic process
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tool: Option<Tool>,
+    /// where a real device is found; for `tool.device` inverse3, touch and forcedimension
+    #[serde(skip_serializing_if = "is_default")]
+    pub device: DeviceSection,
     /// ChainMail and the mapper
     pub deformation: Deformation,
     /// loop, contact, limits of the device
@@ -172,6 +179,7 @@ impl Default for Scene {
             accuracy: Accuracy::Balanced,
             volume: VolumeSection::default(),
             tool: None,
+            device: DeviceSection::default(),
             deformation: Deformation::default(),
             haptic: Haptic::default(),
             rendering: Rendering::default(),

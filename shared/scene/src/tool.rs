@@ -20,6 +20,21 @@ pub enum ToolKind {
     Blade,
 }
 
+/// What of the tool touches tissue.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Shape {
+    /// the tip: one sphere
+    #[default]
+    Tip,
+    /// tip and shaft: a capsule of `shaft_mm`
+    Shaft,
+    /// a finger's pad of the tip's radius, for the effect `palpation`
+    Finger,
+    /// the curved face of an ultrasound probe, for the effect `palpation`
+    Probe,
+}
+
 /// What moves the tool; a string in the scene and on the command line.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
@@ -35,10 +50,64 @@ pub enum Device {
     Console,
     /// `"external"`: a device driven by another process, through two cells of the control block; see `maille_contract::DeviceState`
     External,
+    /// a real device, by the kind of `maille_device`
+    Real(RealDevice),
+}
+
+/// Real devices, bound at run time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RealDevice {
+    /// `"inverse3"`: Haply Inverse3, by its service's WebSocket
+    Inverse3,
+    /// `"touch"`: 3D Systems Touch, by libHD
+    Touch,
+    /// `"forcedimension"`: Force Dimension's devices, by libdhd
+    ForceDimension,
+}
+
+impl RealDevice {
+    /// All, with their names.
+    pub const ALL: [(Self, &str); 3] = [(Self::Inverse3, "inverse3"), (Self::Touch, "touch"), (Self::ForceDimension, "forcedimension")];
+
+    /// Its name in scenes and on the command line.
+    pub fn name(self) -> &'static str {
+        Self::ALL.into_iter().find(|(device, _)| *device == self).map_or("", |(_, name)| name)
+    }
+}
+
+/// Profiles of real devices by name, as `maille_device::profiles` has them.
+pub const PROFILES: &[&str] = &["Touch", "omega", "delta.3", "sigma.7", "Inverse3"];
+
+/// `[device]`: where a real device is found and how it stands to the patient. Without the table: one device on this machine, its origin at
+/// the tool's first way point, its axes right, up and towards the user, in front of a patient on the back with the head to the user's left.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DeviceSection {
+    /// inverse3: host and port of its service; by default 127.0.0.1:10001
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub address: Option<String>,
+    /// touch, forcedimension: the vendor's shared object; by default where the system finds it
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub library: Option<PathBuf>,
+    /// touch: configuration name; inverse3: device id; by default the first
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub id: Option<String>,
+    /// what it can do, by name: Touch, omega, delta.3, sigma.7, Inverse3; by default the usual one of its kind
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub profile: Option<String>,
+    /// where the device's origin lies [mm, LPS]; by default at the tool's first way point
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub origin_mm: Option<[f64; 3]>,
+    /// from the device's axes to the patient's, row by row, a rotation
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rotation: Option<[[f64; 3]; 3]>,
+    /// millimetres in the patient for a millimetre of the hand, 0.1 to 10; by default 1
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
 }
 
 /// Devices that exist, for messages.
-pub const DEVICES: &[&str] = &["path", "sim", "console", "external", "path:FILE"];
+pub const DEVICES: &[&str] = &["path", "sim", "console", "external", "inverse3", "touch", "forcedimension", "path:FILE"];
 
 impl TryFrom<String> for Device {
     type Error = String;
@@ -49,7 +118,9 @@ impl TryFrom<String> for Device {
             "sim" => Ok(Self::Sim),
             "console" => Ok(Self::Console),
             "external" => Ok(Self::External),
-            "inverse3" => Err("the device `inverse3` is declared for later and not built yet; use `sim`, `path` or `console`".into()),
+            _ if RealDevice::ALL.iter().any(|(_, name)| *name == text) => {
+                Ok(Self::Real(RealDevice::ALL.iter().find(|(_, name)| *name == text).map_or(RealDevice::Inverse3, |(device, _)| *device)))
+            }
             _ => match text.strip_prefix("path:") {
                 Some("") => Err("`path:` wants a file name after the colon".into()),
                 Some(file) => Ok(Self::PathFile(file.into())),
@@ -67,6 +138,7 @@ impl From<Device> for String {
             Device::Sim => "sim".into(),
             Device::Console => "console".into(),
             Device::External => "external".into(),
+            Device::Real(device) => device.name().into(),
         }
     }
 }
@@ -79,6 +151,10 @@ pub struct Tool {
     pub kind: ToolKind,
     /// radius of the spherical tip [mm], 0.1 to 20
     pub radius_mm: f64,
+    /// what of it touches tissue
+    pub shape: Shape,
+    /// length of shaft that touches tissue, with `shape = "shaft"` [mm], 1 to 300
+    pub shaft_mm: f64,
     /// length of a blade's edge [mm], 1 to 100
     pub blade_mm: f64,
     /// what moves it
@@ -108,6 +184,8 @@ impl Default for Tool {
         Self {
             kind: ToolKind::Endoscope,
             radius_mm: 2.0,
+            shape: Shape::Tip,
+            shaft_mm: 40.0,
             blade_mm: 10.0,
             device: Device::Path,
             looped: true,

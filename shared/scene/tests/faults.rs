@@ -29,8 +29,14 @@ fn an_unknown_word_is_answered_with_the_words_there_are() {
     assert!(error.to_string().contains("`head`") && error.to_string().contains("`torso`"), "{error}");
     let error = fault("[tool]\ndevice = \"simm\"\n[tool.approach]");
     assert!(error.to_string().contains("did you mean `sim`?"), "{error}");
-    let error = fault("[tool]\ndevice = \"inverse3\"\n[tool.approach]");
-    assert!(error.to_string().contains("not built yet"), "{error}");
+    let error = fault("[tool]\ndevice = \"inverse4\"\n[tool.approach]");
+    assert!(error.to_string().contains("did you mean `inverse3`?"), "{error}");
+    let error = fault("[tool]\nkind = \"blade\"\n[tool.approach]");
+    assert!(error.to_string().contains("cutting"), "{error}");
+    let error = fault("[device]\nprofile = \"feather\"");
+    assert!(error.to_string().contains("sigma.7") || error.to_string().contains("no profile"), "{error}");
+    let error = fault("[device]\nrotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]]");
+    assert!(error.to_string().contains("no rotation"), "{error}");
 }
 
 #[test]

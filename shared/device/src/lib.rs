@@ -96,17 +96,22 @@ impl Default for Options {
     }
 }
 
+/// What a device of this kind can do: what `options` say, or the usual one.
+pub fn profile(kind: Kind, options: &Options) -> DeviceProfile {
+    options.profile.unwrap_or(match kind {
+        Kind::Inverse3 => profiles::INVERSE3,
+        Kind::Touch => profiles::TOUCH,
+        Kind::ForceDimension => profiles::OMEGA,
+    })
+}
+
 /// Opens a device. A thread of its own looks for it until it is found, and again whenever it is unplugged; until then it
 /// reads as unplugged.
 ///
 /// # Errors
 /// When the vendor's library is missing or lacks a function, or a thread cannot be started. A device that is not plugged in is no error.
 pub fn open(kind: Kind, options: &Options) -> Result<RemoteDevice, DeviceError> {
-    let profile = options.profile.unwrap_or(match kind {
-        Kind::Inverse3 => profiles::INVERSE3,
-        Kind::Touch => profiles::TOUCH,
-        Kind::ForceDimension => profiles::OMEGA,
-    });
+    let profile = profile(kind, options);
     match kind {
         Kind::Inverse3 => RemoteDevice::start(inverse3::Inverse3::new(options), profile, options.mounting),
         Kind::Touch => RemoteDevice::start(touch::Touch::load(options)?, profile, options.mounting),

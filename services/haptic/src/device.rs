@@ -1,0 +1,61 @@
+//! From the scene's `[device]` to a real device.
+
+use crate::HapticError;
+use maille_device::{Kind, Mounting, Options, RemoteDevice, profiles};
+use maille_scene::{Device, RealDevice, Scene, Tool, Waypoints};
+
+/// The real device that a tool asks for.
+pub(crate) fn kind(tool: &Tool) -> Option<Kind> {
+    match tool.device {
+        Device::Real(RealDevice::Inverse3) => Some(Kind::Inverse3),
+        Device::Real(RealDevice::Touch) => Some(Kind::Touch),
+        Device::Real(RealDevice::ForceDimension) => Some(Kind::ForceDimension),
+        _ => None,
+    }
+}
+
+/// How to find and use it.
+pub(crate) fn options(scene: &Scene) -> Result<Options, HapticError> {
+    let d = &scene.device;
+    let named = |name: &String| {
+        let known = || profiles::ALL.map(|p| p.name).join(", ");
+        profiles::named(name).ok_or_else(|| HapticError::Scene(format!("there is no device profile `{name}`; there are {}", known())))
+    };
+    let usual = Options::default();
+    let front = Mounting::in_front_of_patient(d.origin_mm.unwrap_or_default());
+    Ok(Options {
+        address: d.address.clone().unwrap_or(usual.address),
+        library: d.library.clone(),
+        device: d.id.clone(),
+        mounting: Mounting { rotation: d.rotation.unwrap_or(front.rotation), scale: d.scale.unwrap_or(1.0), ..front },
+        profile: d.profile.as_ref().map(named).transpose()?,
+        ..usual
+    })
+}
+
+/// Opens it, its origin at the first way point where the scene says no other. A device that is not plugged in is waited for.
+pub(crate) fn open(kind: Kind, mut options: Options, way: &Waypoints) -> Result<RemoteDevice, HapticError> {
+    if options.mounting.origin_mm == [0.0; 3] {
+        options.mounting.origin_mm = way.at(0.0).position_mm;
+    }
+    Ok(maille_device::open(kind, &options)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_scenes_call_devices_is_what_devices_are_called() {
+        for (device, name) in RealDevice::ALL {
+            let tool = Tool { device: Device::Real(device), ..Tool::default() };
+            assert_eq!(kind(&tool).map(Kind::name), Some(name));
+        }
+        assert_eq!(maille_scene::PROFILES, profiles::ALL.map(|p| p.name));
+        let mut scene = Scene::builtin_default();
+        scene.device.profile = Some("touch".into());
+        assert_eq!(options(&scene).unwrap().profile, Some(profiles::TOUCH));
+        scene.device.profile = Some("feather".into());
+        assert!(options(&scene).is_err());
+    }
+}
