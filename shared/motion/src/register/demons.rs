@@ -15,13 +15,24 @@ pub struct RegisterOptions {
     pub sigma: f32,
     /// κ: twice the longest step [voxels of the level]
     pub kappa: f32,
+    /// σ of the Gaussian that stiffens bone [mm]
+    pub stiff_mm: f32,
     /// det J below which a cell is smoothed at the end
     pub least_determinant: f32,
 }
 
+/// What is known of the reference's anatomy, one truth a voxel.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Anatomy<'a> {
+    /// inside this, organs slide along what is outside
+    pub slides: Option<&'a [bool]>,
+    /// bone: moves nearly as a piece, and feels little of its neighbours
+    pub stiff: Option<&'a [bool]>,
+}
+
 impl Default for RegisterOptions {
     fn default() -> Self {
-        Self { iterations: vec![60, 50, 30], sigma: 1.0, kappa: 1.4, least_determinant: 0.1 }
+        Self { iterations: vec![60, 50, 30], sigma: 1.0, kappa: 1.4, stiff_mm: 4.0, least_determinant: 0.1 }
     }
 }
 
@@ -31,7 +42,21 @@ struct Level {
     reference: Vec<f32>,
     phase: Vec<f32>,
     border: Option<Border>,
+    bone: Option<Bone>,
 }
+
+/// Bone as smoothing sees it.
+struct Bone {
+    /// 1 in bone
+    inside: Vec<f32>,
+    /// its Gaussian, of the stiffness's width
+    share: Vec<f32>,
+    /// σ [nodes]
+    sigma: f32,
+}
+
+/// Iterations from one stiffening of bone to the next.
+const STIFFEN: usize = 3;
 
 /// A mask as smoothing sees it.
 struct Border {
@@ -46,7 +71,7 @@ struct Border {
 /// A field, one array a component, along the grid's axes [mm].
 type Components = [Vec<f32>; 3];
 
-/// Where the points of the reference have gone in the phase [mm, LPS]; organs slide along the border of `mask`, if there is one.
+/// Where the points of the reference have gone in the phase [mm, LPS]; by what is known of the reference's `anatomy`.
 ///
 /// `progress` is told (level, iteration, RMS of the difference [HU]).
 ///
@@ -55,19 +80,20 @@ type Components = [Vec<f32>; 3];
 pub fn register(
     reference: &ScalarField,
     phase: &ScalarField,
-    mask: Option<&[bool]>,
+    anatomy: &Anatomy,
     options: &RegisterOptions,
     mut progress: impl FnMut(usize, usize, f32),
 ) -> Result<VectorField, String> {
     let grid = &reference.grid;
-    if phase.grid != *grid || mask.is_some_and(|m| m.len() != grid.voxel_count()) || grid.size.iter().any(|&s| s < 4) {
+    let masks = [anatomy.slides, anatomy.stiff];
+    if phase.grid != *grid || masks.iter().flatten().any(|m| m.len() != grid.voxel_count()) || grid.size.iter().any(|&s| s < 4) {
         return Err(format!(
-            "reference, phase and mask must lie on one grid of four nodes or more an axis; the reference has {:?}, the phase {:?}",
+            "reference, phase and masks must lie on one grid of four nodes or more an axis; the reference has {:?}, the phase {:?}",
             grid.size, phase.grid.size
         ));
     }
     let finest = Lattice { size: grid.size, spacing: grid.spacing.map(|s| s as f32) };
-    let inside = mask.map(|m| m.iter().map(|&b| f32::from(u8::from(b))).collect::<Vec<_>>());
+    let inside = masks.map(|mask| mask.map(|m| m.iter().map(|&b| f32::from(u8::from(b))).collect::<Vec<_>>()));
     let mut raw = vec![(finest, reference.values.clone(), phase.values.clone(), inside)];
     for _ in 1..options.iterations.len() {
         let (lattice, r, p, m) = raw.last().expect("there is a level");
@@ -75,15 +101,27 @@ pub fn register(
         if half == *lattice {
             break;
         }
-        raw.push((half, halve(lattice, r), halve(lattice, p), m.as_ref().map(|m| halve(lattice, m).into_iter().map(f32::round).collect())));
+        raw.push((
+            half,
+            halve(lattice, r),
+            halve(lattice, p),
+            m.each_ref().map(|m| m.as_ref().map(|m| halve(lattice, m).into_iter().map(f32::round).collect())),
+        ));
     }
-    let mut field: Components = std::array::from_fn(|_| Vec::new());
+    let mut coarser: Option<(Components, Option<Vec<f32>>)> = None;
     let skipped = options.iterations.len() - raw.len();
-    for (n, (lattice, reference, phase, inside)) in raw.into_iter().rev().enumerate() {
-        let level = Level { border: inside.map(|m| Border::new(&lattice, m, options.sigma)), lattice, reference, phase };
-        field = if n == 0 { std::array::from_fn(|_| vec![0.0; lattice.count()]) } else { field.map(|f| double(&lattice, &f)) };
+    for (n, (lattice, reference, phase, [slides, stiff])) in raw.into_iter().rev().enumerate() {
+        let mut field = match &coarser {
+            None => std::array::from_fn(|_| vec![0.0; lattice.count()]),
+            Some((field, side)) => field.each_ref().map(|f| double_by_side(&lattice, f, side.as_deref(), slides.as_deref())),
+        };
+        let border = slides.map(|m| Border::new(&lattice, m, options.sigma));
+        let bone = stiff.map(|m| Bone::new(&lattice, m, options.stiff_mm));
+        let level = Level { lattice, reference, phase, border, bone };
         level.run(&mut field, options, options.iterations[n + skipped], |iteration, rms| progress(n, iteration, rms));
+        coarser = Some((field, level.border.map(|b| b.inside)));
     }
+    let (field, _) = coarser.expect("there is a level");
     Ok(unfold(grid, field, options.least_determinant))
 }
 
@@ -103,6 +141,46 @@ impl Border {
             [g[0] / length, g[1] / length, g[2] / length, near]
         };
         Self { normal: (0..lattice.count()).into_par_iter().map(normal).collect(), inside, share }
+    }
+}
+
+/// Values at the nodes of a finer lattice; where there is a border, each side's from that side's alone.
+fn double_by_side(fine: &Lattice, values: &[f32], coarse_inside: Option<&[f32]>, inside: Option<&[f32]>) -> Vec<f32> {
+    let mut whole = double(fine, values);
+    if let (Some(coarse_inside), Some(inside)) = (coarse_inside, inside) {
+        let part: Vec<f32> = values.iter().zip(coarse_inside).map(|(u, m)| u * m).collect();
+        let (part, share) = (double(fine, &part), double(fine, coarse_inside));
+        whole.par_iter_mut().zip(part).zip(share).zip(inside).for_each(|(((u, part), share), &inside)| {
+            // what is not inside is outside; a side that the coarser lattice does not see keeps the mixture
+            let (own, weight) = if inside > 0.5 { (part, share) } else { (*u - part, 1.0 - share) };
+            if weight > 0.05 {
+                *u = own / weight;
+            }
+        });
+    }
+    whole
+}
+
+impl Bone {
+    fn new(lattice: &Lattice, inside: Vec<f32>, stiff_mm: f32) -> Self {
+        let sigma = (stiff_mm / lattice.spacing.iter().copied().fold(f32::INFINITY, f32::min)).max(0.5);
+        let mut share = inside.clone();
+        smooth(lattice, sigma, &mut share, &mut Vec::new());
+        Self { inside, share, sigma }
+    }
+
+    /// u in bone ← its mean over bone nearby.
+    fn stiffen(&self, lattice: &Lattice, field: &mut Components, part: &mut Vec<f32>, spare: &mut Vec<f32>) {
+        for u in field {
+            part.clear();
+            part.par_extend(u.par_iter().zip(&self.inside).map(|(u, m)| u * m));
+            smooth(lattice, self.sigma, part, spare);
+            u.par_iter_mut().zip(&*part).zip(&self.inside).zip(&self.share).for_each(|(((u, p), &m), s)| {
+                if m > 0.5 {
+                    *u = p / s;
+                }
+            });
+        }
     }
 }
 
@@ -154,6 +232,11 @@ impl Level {
                 .sum();
             progress(iteration, (squares / (nx * ny * lattice.size[2]) as f64).sqrt() as f32);
             self.regularise(field, options.sigma, &mut sides, &mut spare);
+            if let Some(bone) = &self.bone
+                && (iteration % STIFFEN == 0 || iteration + 1 == iterations)
+            {
+                bone.stiffen(lattice, field, &mut sides[0], &mut spare);
+            }
         }
     }
 

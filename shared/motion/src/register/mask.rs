@@ -1,4 +1,4 @@
-//! The lungs in a CT, made without help: what is as thin as lung, in one large piece, and not the air around the patient.
+//! The lungs and the bones in a CT, found without help: lung is what is as thin, in one large piece, and not the air around the patient.
 //!
 //! Voxels below −350 HU, in pieces connected by faces; a piece is lung when it has a hundredth of the volume or more and its mean is above −950 HU (air
 //! around the patient is below). Holes and vessels up to a few voxels are closed (dilated by `CLOSE` voxels, then eroded).
@@ -7,14 +7,37 @@ use maille_volume::ScalarField;
 
 const THIN_HU: f32 = -350.0;
 const AIR_HU: f32 = -950.0;
+const BONE_HU: f32 = 200.0;
 /// Voxels by which vessels are closed.
 const CLOSE: usize = 3;
 
 /// True inside the lungs.
 pub fn lung_mask(image: &ScalarField) -> Vec<bool> {
+    let least = image.values.len().div_ceil(100);
+    let mut mask = pieces(image, |v| v < THIN_HU, |count, mean| count >= least && mean > AIR_HU);
+    for grow in [true, false] {
+        for _ in 0..CLOSE {
+            mask = step(&mask, image.grid.size, grow);
+        }
+    }
+    mask
+}
+
+/// True in bone: above 200 HU in pieces of a hundredth of a per cent of the volume or more, marrow and one voxel around included.
+pub fn bone_mask(image: &ScalarField) -> Vec<bool> {
+    let least = image.values.len().div_ceil(10_000);
+    let mut mask = pieces(image, |v| v > BONE_HU, |count, _| count >= least);
+    for grow in [true, true, true, false, false] {
+        mask = step(&mask, image.grid.size, grow);
+    }
+    mask
+}
+
+/// Voxels whose value is `of` the sort, in the pieces (connected by faces) that are kept by their count and mean.
+fn pieces(image: &ScalarField, of: impl Fn(f32) -> bool, keep: impl Fn(usize, f32) -> bool) -> Vec<bool> {
     let ([nx, ny, nz], count) = (image.grid.size, image.values.len());
     let mut mask = vec![false; count];
-    let mut seen: Vec<bool> = image.values.iter().map(|&v| v.is_nan() || v >= THIN_HU).collect();
+    let mut seen: Vec<bool> = image.values.iter().map(|&v| !of(v)).collect();
     let mut piece = Vec::new();
     for start in 0..count {
         if seen[start] {
@@ -28,23 +51,18 @@ pub fn lung_mask(image: &ScalarField) -> Vec<bool> {
             next += 1;
             sum += f64::from(image.values[n]);
             let (i, j, k) = (n % nx, n / nx % ny, n / (nx * ny));
-            let neighbours = [(i > 0, -1), (i + 1 < nx, 1), (j > 0, -(nx as isize)), (j + 1 < ny, nx as isize)];
-            let slice = (nx * ny) as isize;
-            for (there, step) in neighbours.into_iter().chain([(k > 0, -slice), (k + 1 < nz, slice)]) {
-                let m = (n as isize + step) as usize;
+            let (row, slice) = (nx as isize, (nx * ny) as isize);
+            let neighbours = [(i > 0, -1), (i + 1 < nx, 1), (j > 0, -row), (j + 1 < ny, row), (k > 0, -slice), (k + 1 < nz, slice)];
+            for (there, step) in neighbours {
+                let m = n.wrapping_add_signed(step);
                 if there && !seen[m] {
                     seen[m] = true;
                     piece.push(m);
                 }
             }
         }
-        if piece.len() * 100 >= count && sum / piece.len() as f64 > f64::from(AIR_HU) {
+        if keep(piece.len(), (sum / piece.len() as f64) as f32) {
             piece.iter().for_each(|&n| mask[n] = true);
-        }
-    }
-    for grow in [true, false] {
-        for _ in 0..CLOSE {
-            mask = step(&mask, [nx, ny, nz], grow);
         }
     }
     mask
