@@ -3,14 +3,12 @@
 //! `cargo run --release -p maille-motion --example fourd_ct -- FOLDER [--sliding] [--stiff] [--predict] [--phases 4,8]` with FOLDER/phase01.mha … phase10.mha.
 
 use maille_motion::model::{fit_full_cycle, fit_half_cycle, fit_surrogate};
+use maille_motion::phases::{air_ml, ends, rates, rms_hu};
 use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, lung_mask, register};
-use maille_motion::resample::{jacobian_determinant, sample};
+use maille_motion::resample::jacobian_determinant;
 use maille_motion::{MotionModel, Precision, Weights};
 use maille_volume::{ScalarField, VectorField, io::read_image};
 use std::{path::Path, time::Instant};
-
-/// Voxels at the border that are not judged: what lies there has left the image in some phase.
-const MARGIN: usize = 8;
 
 fn read(path: &Path) -> ScalarField {
     let image = read_image(path).unwrap_or_else(|fault| panic!("{fault}"));
@@ -18,29 +16,8 @@ fn read(path: &Path) -> ScalarField {
     ScalarField { grid: image.grid, values }
 }
 
-/// RMS of phase(X + u) − reference(X) [HU], margin left out.
 fn rms(reference: &ScalarField, phase: &ScalarField, u: &VectorField) -> f64 {
-    let [nx, ny, nz] = reference.grid.size;
-    let as_field =
-        |image: &ScalarField| VectorField { grid: image.grid.clone(), vectors: image.values.iter().map(|&v| [v, 0.0, 0.0]).collect() };
-    let (phase, spacing) = (as_field(phase), reference.grid.spacing);
-    let (mut squares, mut count) = (0.0, 0.0);
-    for k in MARGIN..nz - MARGIN {
-        for j in MARGIN..ny - MARGIN {
-            for i in MARGIN..nx - MARGIN {
-                let n = reference.grid.offset(i, j, k);
-                let v = u.vectors[n];
-                let at = [
-                    i as f64 + f64::from(v[0]) / spacing[0],
-                    j as f64 + f64::from(v[1]) / spacing[1],
-                    k as f64 + f64::from(v[2]) / spacing[2],
-                ];
-                squares += f64::from(sample(&phase, at)[0] - reference.values[n]).powi(2);
-                count += 1.0;
-            }
-        }
-    }
-    f64::sqrt(squares / count)
+    rms_hu(reference, phase, Some(u))
 }
 
 /// u of a model at the nodes of the images.
@@ -133,17 +110,16 @@ fn main() {
 
 /// Fits on odd phases, judges on even ones.
 fn predict(images: &[ScalarField], fields: &[VectorField]) {
-    // the signal: how much of the image is lung [10³ voxels], and its slope over the cycle by central differences
-    let volume: Vec<f64> =
-        images.iter().map(|i| i.values.iter().map(|&v| f64::from(((-v - 200.0) / 600.0).clamp(0.0, 1.0))).sum::<f64>() / 1e3).collect();
-    let slope = |n: usize| (volume[(n + 1) % 10] - volume[(n + 9) % 10]) / 2.0;
-    let signal = |n: usize| vec![volume[n], slope(n)];
+    // the signal: the air in the image [ml], and its slope over a cycle of 4 s
+    let volume: Vec<f64> = images.iter().map(air_ml).collect();
+    let slope = rates(&volume, 4.0);
+    let signal = |n: usize| vec![volume[n], slope[n]];
     println!("signal: {:.1?}", volume);
     let odd: Vec<usize> = (0..10).step_by(2).collect();
     let of = |list: &[usize]| list.iter().map(|&n| fields[n].clone()).collect::<Vec<_>>();
     let full = fit_full_cycle(&of(&odd), &odd.iter().map(|&n| n as f64 / 10.0).collect::<Vec<_>>(), 0.7, 0.3, Precision::I16)
         .expect("five phases");
-    let ends = [volume.iter().copied().fold(f64::MAX, f64::min), volume.iter().copied().fold(f64::MIN, f64::max)];
+    let ends = ends(&volume).map(|n| volume[n]);
     let surrogate = fit_surrogate(&of(&odd), &odd.iter().map(|&n| signal(n)).collect::<Vec<_>>(), ends, Precision::I16)
         .expect("five phases, two signals");
     // the half cycle: odd phases from the fullest lung to the emptiest, placed by the signal

@@ -12,6 +12,7 @@
 pub mod breath;
 mod error;
 pub mod model;
+pub mod phases;
 pub mod register;
 pub mod resample;
 pub mod signal;
