@@ -213,3 +213,41 @@ fn a_coarser_grid_costs_accuracy_that_is_known() {
     // Taylor: h²/8 · amplitude·(2π/wavelength)², h = 5.1 mm along x: 0.05 mm, and the fine grid's own
     assert!(worst < 0.08, "{worst}");
 }
+
+#[test]
+fn a_hand_at_rest_on_breathing_skin_feels_no_step_and_sees_what_it_feels() {
+    let model = surrogate(Precision::I16);
+    // a trace with holes of a second and zeros in it
+    let rows = (0..1500).map(|n| (n, f64::from(n) * 0.04)).filter(|(n, _)| n % 120 >= 25);
+    let rows = rows.map(|(n, t)| (t, if n % 97 == 0 { 0.0 } else { 20.0 + 3.0 * (t * 1.6).sin() }));
+    let trace = signal::Trace::new("torn", rows).unwrap();
+    let breather = signal::Recorded::new(&trace, &signal::Conditioning::default()).unwrap();
+    let mut collapsed = Collapsed::new(&model, 0.01);
+    let tool = grid().world_from_index([20.3, 15.8, 22.1]);
+    let (mut guess, mut last) = (tool, None::<[f64; 3]>);
+    let (mut step, mut travel, mut residual, mut apart): (f64, f64, f64, f64) = (0.0, 0.0, 0.0, 0.0);
+    let (mut low, mut high) = (f64::MAX, f64::MIN);
+    for tick in 0..20_000u64 {
+        let weights = model.weights(&breather.at(tick * 1_000_000));
+        let found = MotionAt::new(&model, weights).to_reference(tool, guess);
+        assert!(found.converged, "{tick}: {found:?}");
+        guess = found.reference;
+        residual = residual.max(found.residual_mm);
+        let moved = last.map_or(0.0, |l: [f64; 3]| (Vector3::from(l) - Vector3::from(guess)).norm());
+        (step, travel, last) = (step.max(moved), travel + moved, Some(guess));
+        (low, high) = (low.min(guess[2]), high.max(guess[2]));
+        if tick % 500 == 0 {
+            collapsed.update(&model, &weights);
+            let seen = collapsed.reference_index(grid().index_from_world(tool).map(|i| i as f32));
+            let seen = grid().world_from_index(seen.map(f64::from));
+            apart = apart.max((Vector3::from(seen) - Vector3::from(guess)).norm());
+        }
+    }
+    println!(
+        "a hand at rest on breathing tissue that moves {:.1} mm: largest step {step:.4} mm a tick, residual {residual:.1e} mm, picture and hand {apart:.4} mm apart",
+        high - low
+    );
+    // it follows: millimetres in all, microns a tick (0.1 mm would be felt: 1 N/mm and a force step of 0.1 N)
+    assert!(high - low > 2.0 && travel > 10.0 && step < 0.05, "{step} {travel}");
+    assert!(residual < 2e-3 && apart < 0.1, "{residual} {apart}");
+}
