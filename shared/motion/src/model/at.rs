@@ -210,6 +210,26 @@ impl Shape {
         }
     }
 
+    /// The cell at a place that is known to lie on the grid, and where in it.
+    #[inline(always)]
+    pub(super) fn cell_inside(&self, index: f32x4) -> (usize, [f32; 3]) {
+        let [x, y, z, _] = index.to_array();
+        let (i, j, k) = ((x as usize).min(self.cells[0]), (y as usize).min(self.cells[1]), (z as usize).min(self.cells[2]));
+        (k * self.slice + j * self.row + i, [x - i as f32, y - j as f32, z - k as f32])
+    }
+
+    /// Index of the last node.
+    #[inline(always)]
+    pub(super) fn last(&self) -> f32x4 {
+        self.last
+    }
+
+    /// Nodes from one row, and from one slice, to the next.
+    #[inline(always)]
+    pub(super) fn strides(&self) -> (usize, usize) {
+        (self.row, self.slice)
+    }
+
     #[inline(always)]
     pub(super) fn blend(&self, cell: &Cell, node: impl Fn(usize) -> f32x4) -> f32x4 {
         let [x, y, z] = cell.fraction;

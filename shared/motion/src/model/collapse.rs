@@ -1,19 +1,21 @@
 //! One field for a moment, and its inverse, kept and renewed from moment to moment.
 //!
-//! u = Σ c_k·B_k at the nodes, i16 with one scale; then v at the same nodes, x + v(x) = X with X + u(X) = x, by `maille-displacement`'s row kernel
-//! from the last moment's v (breathing is smooth in time), line by line, in parallel. Nodes that the row
-//! kernel gives up go through damped Newton; those that fail as well keep their best X and are counted.
+//! u = Σ c_k·B_k at the nodes, i16 with one scale; then v at the same nodes, x + v(x) = X with X + u(X) = x, by `maille-displacement`'s rules and kernels
+//! from where the last two moments' v lead (breathing is smooth in time), line by line, in parallel. The first step of the fixed point is taken
+//! here, two nodes of the field in a register; nodes that it does not settle go on in `Inverter`'s kernels, by damped Newton in the end;
+//! those that fail as well keep their best X and are counted.
 //!
-//! Both in index units of the grid, error of storage half a step: (longest u)/32 767/2. Memory: 8 + 8 + 8 bytes a node.
+//! Both in index units of the grid, error of storage half a step: (longest u)/32 767/2. Memory: 8 + 8 + 8 bytes a node (u, v, where v begins next).
 //! Whoever wants u or X at few points takes [`super::MotionAt`] instead: it collapses nothing.
 
 use super::at::Shape;
+use super::packed::two_nodes;
 use super::{MotionModel, Weights};
 use maille_displacement::{DisplacementField, FieldSample, Inverter, RowField, Scheme};
 use maille_volume::VectorField;
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use wide::f32x4;
+use wide::{f32x4, f32x8, i16x8};
 
 /// A motion at one moment, at the nodes of its grid.
 #[derive(Clone, Debug)]
@@ -23,6 +25,8 @@ pub struct Collapsed {
     forward: Vec<[i16; 4]>,
     forward_scale: f32,
     inverse: Vec<[i16; 4]>,
+    /// where the next moment's v begins: this one and its last change
+    ahead: Vec<[i16; 4]>,
     inverse_scale: f32,
     inverter: Inverter,
     warm: bool,
@@ -60,6 +64,7 @@ impl Collapsed {
             forward: Vec::new(),
             forward_scale: 1.0,
             inverse: vec![[0; 4]; model.grid.voxel_count()],
+            ahead: vec![[0; 4]; model.grid.voxel_count()],
             inverse_scale: 1.0,
             inverter: inverter.on_spacing(spacing),
             warm: false,
@@ -79,15 +84,19 @@ impl Collapsed {
         let longest: f32 = weights.iter().map(|(k, c)| c.abs() * model.fields[k].longest_mm()).sum::<f32>() / smallest;
         self.forward_scale = (longest / 32_000.0).max(1e-30);
         self.forward.resize(model.grid.voxel_count(), [0; 4]);
-        let to_steps = f32x4::splat(1.0 / self.forward_scale);
-        const RUN: usize = 1 << 12;
+        let to_steps = f32x8::splat(1.0 / self.forward_scale);
+        // the sum of a run stays in the first cache
+        const RUN: usize = 1 << 10;
         self.forward.par_chunks_mut(RUN).enumerate().for_each(|(run, out)| {
-            let mut sum = [f32x4::ZERO; RUN];
-            let sum = &mut sum[..out.len()];
+            let mut sum = [f32x8::ZERO; RUN / 2];
+            let sum = &mut sum[..out.len().div_ceil(2)];
             for (k, c) in weights.iter() {
                 model.fields[k].add_to(run * RUN, c, sum);
             }
-            out.iter_mut().zip(sum).for_each(|(o, u)| *o = steps(*u * to_steps));
+            for (out, u) in out.chunks_mut(2).zip(sum) {
+                let pair: [[i16; 4]; 2] = bytemuck::cast(i16x8::from_i32x8_saturate((*u * to_steps).fast_round_int()));
+                out.copy_from_slice(&pair[..out.len()]);
+            }
         });
     }
 
@@ -98,22 +107,33 @@ impl Collapsed {
         let field = Nodes { shape: &self.shape, nodes: &self.forward, scale };
         let (inverter, warm, size) = (&self.inverter, self.warm, self.size);
         let slow = Inverter { scheme: Scheme::Newton, contraction: 0.0, ..*inverter };
+        let [wx, wy, wz] = inverter.weight;
+        // as in the row kernel: the step's length bounds the error of where it leads
+        let stop = f32x4::splat(inverter.stop() / inverter.contraction) / f32x4::new([wx, wy, wz, 1.0]);
         let report = self
             .inverse
             .par_chunks_mut(size[0])
+            .zip(self.ahead.par_chunks_mut(size[0]))
             .enumerate()
-            .map(|(line, out)| {
+            .map(|(line, (inverse, ahead))| {
                 let (j, k) = ((line % size[1]) as f32, (line / size[1]) as f32);
                 let mut report = CollapseReport::default();
-                for (block, out) in out.chunks_mut(ROW).enumerate() {
+                for (block, (inverse, ahead)) in inverse.chunks_mut(ROW).zip(ahead.chunks_mut(ROW)).enumerate() {
                     let target: [f32x4; ROW] = std::array::from_fn(|n| f32x4::new([(block * ROW + n) as f32, j, k, 0.0]));
                     let mut position = target;
-                    for (n, v) in out.iter().enumerate() {
-                        position[n] += if warm { numbers(*v) * old_scale } else { f32x4::ZERO };
+                    let mut open = 0u32;
+                    for (n, v) in ahead.iter().enumerate() {
+                        let start = target[n] + numbers(*v) * old_scale;
+                        position[n] = target[n] - field.at_once(start);
+                        let settled = (position[n] - start).abs().simd_le(stop).to_bitmask() == 0b1111;
+                        open |= u32::from(!settled) << n;
                     }
-                    let mut converged = [false; ROW];
-                    report.evaluations += u64::from(inverter.invert_row(&field, &target, 0..out.len(), &mut position, &mut converged));
-                    for (n, out) in out.iter_mut().enumerate() {
+                    report.evaluations += inverse.len() as u64;
+                    while open != 0 {
+                        let n = open.trailing_zeros() as usize;
+                        open &= open - 1;
+                        let mut converged = [false; ROW];
+                        report.evaluations += u64::from(inverter.invert_row(&field, &target, n..n + 1, &mut position, &mut converged));
                         if !converged[n] {
                             let lanes = |v: f32x4| -> [f32; 3] { std::array::from_fn(|c| v.to_array()[c]) };
                             let found = slow.invert(&field, lanes(target[n]), lanes(target[n]));
@@ -122,7 +142,15 @@ impl Collapsed {
                             report.unsettled += usize::from(!found.converged);
                             position[n] = f32x4::new([found.position[0], found.position[1], found.position[2], 0.0]);
                         }
-                        *out = steps((position[n] - target[n]) * (1.0 / scale));
+                    }
+                    let to_steps = 1.0 / scale;
+                    for (n, (inverse, ahead)) in inverse.iter_mut().zip(ahead).enumerate() {
+                        let v = position[n] - target[n];
+                        let before = if warm { numbers(*inverse) * old_scale } else { v };
+                        let pair: [[f32; 4]; 2] = [v.to_array(), (v + v - before).to_array()];
+                        let steps: [[i16; 4]; 2] =
+                            bytemuck::cast(i16x8::from_i32x8_saturate((bytemuck::cast::<_, f32x8>(pair) * to_steps).fast_round_int()));
+                        [*inverse, *ahead] = steps;
                     }
                 }
                 report
@@ -171,19 +199,29 @@ struct Nodes<'a> {
 
 #[inline(always)]
 fn numbers(node: [i16; 4]) -> f32x4 {
-    f32x4::new(node.map(f32::from))
+    let [low, _]: [f32x4; 2] = bytemuck::cast(two_nodes([node, [0; 4]]));
+    low
 }
 
-#[inline(always)]
-fn steps(v: f32x4) -> [i16; 4] {
-    // `as` saturates, and takes NaN for 0
-    v.to_array().map(|c| (c + 0.5f32.copysign(c)) as i16)
+impl Nodes<'_> {
+    /// u, with the two nodes of an edge in one register.
+    #[inline(always)]
+    fn at_once(&self, index: f32x4) -> f32x4 {
+        let (o, [x, y, z]) = self.shape.cell_inside(index.fast_max(f32x4::ZERO).fast_min(self.shape.last()));
+        let (row, slice) = self.shape.strides();
+        let edge = |o: usize| two_nodes([self.nodes[o], self.nodes[o + 1]]);
+        let mix = |a: f32x8, b: f32x8, t: f32| a + (b - a) * t;
+        let near = mix(edge(o), edge(o + row), y);
+        let far = mix(edge(o + slice), edge(o + slice + row), y);
+        let [low, high]: [f32x4; 2] = bytemuck::cast(mix(near, far, z));
+        (low + (high - low) * x) * self.scale
+    }
 }
 
 impl RowField for Nodes<'_> {
     #[inline]
     fn value(&self, index: f32x4) -> f32x4 {
-        self.shape.blend(&self.shape.cell(index), |at| numbers(self.nodes[at])) * self.scale
+        self.at_once(index)
     }
     #[inline]
     fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]) {

@@ -12,7 +12,7 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
-use wide::f32x4;
+use wide::{f32x8, i32x8};
 
 /// How a field is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -149,17 +149,33 @@ impl PackedField<'_> {
         forward * Vector3::new(f64::from(x), f64::from(y), f64::from(z))
     }
 
-    /// out += c·B over a run of nodes.
-    pub(super) fn add_to(&self, first: usize, c: f32, out: &mut [f32x4]) {
-        let run = first..first + out.len();
+    /// out += c·B over a run of nodes, two in a register; what lies beyond the last node is 0.
+    pub(super) fn add_to(&self, first: usize, c: f32, out: &mut [f32x8]) {
         match &self.nodes {
-            Nodes::F32(v) => out.iter_mut().zip(&v[run]).for_each(|(o, n)| *o += f32x4::new(*n) * c),
-            Nodes::F16(v) => out.iter_mut().zip(&v[run]).for_each(|(o, n)| *o += f32x4::new(n.map(f32_from_half)) * c),
+            Nodes::F32(v) => add(&v[first..], out, |pair| bytemuck::cast::<[[f32; 4]; 2], f32x8>(pair) * c),
+            Nodes::F16(v) => {
+                add(&v[first..], out, |[a, b]| bytemuck::cast::<[[f32; 4]; 2], f32x8>([a.map(f32_from_half), b.map(f32_from_half)]) * c)
+            }
             Nodes::I16(v) => {
                 let c = c * self.measures.scale;
-                out.iter_mut().zip(&v[run]).for_each(|(o, n)| *o += f32x4::new(n.map(f32::from)) * c);
+                add(&v[first..], out, |pair| two_nodes(pair) * c);
             }
         }
+    }
+}
+
+/// Two neighbouring nodes as numbers.
+#[inline(always)]
+pub(super) fn two_nodes(pair: [[i16; 4]; 2]) -> f32x8 {
+    i32x8::from_i16x8(bytemuck::cast(pair)).round_float()
+}
+
+#[inline(always)]
+fn add<T: Copy + Default>(nodes: &[[T; 4]], out: &mut [f32x8], term: impl Fn([[T; 4]; 2]) -> f32x8) {
+    let (pairs, last) = nodes.as_chunks::<2>();
+    out.iter_mut().zip(pairs).for_each(|(o, &pair)| *o += term(pair));
+    if let (Some(o), Some(&node)) = (out.get_mut(pairs.len()), last.first()) {
+        *o += term([node, [T::default(); 4]]);
     }
 }
 
