@@ -11,7 +11,7 @@ use super::packed::{Nodes, PackedField, f32_from_half};
 use super::{MotionModel, Weights};
 use maille_displacement::{DisplacementField, FieldSample, Inverter, RowField, Scheme};
 use nalgebra::{Matrix3, Vector3};
-use wide::f32x4;
+use wide::{f32x4, i32x4};
 
 /// A model under the coefficients of a moment.
 #[derive(Clone, Copy, Debug)]
@@ -177,6 +177,7 @@ impl PackedField<'_> {
 pub(super) struct Shape {
     last: f32x4,
     cells: [usize; 3],
+    last_cell: i32x4,
     row: usize,
     slice: usize,
 }
@@ -193,7 +194,13 @@ pub(super) struct Cell {
 impl Shape {
     pub(super) fn new(grid: &maille_volume::Grid) -> Self {
         let [nx, ny, nz] = grid.size.map(|s| (s - 1) as f32);
-        Self { last: f32x4::new([nx, ny, nz, 0.0]), cells: grid.size.map(|s| s - 2), row: grid.size[0], slice: grid.size[0] * grid.size[1] }
+        Self {
+            last: f32x4::new([nx, ny, nz, 0.0]),
+            cells: grid.size.map(|s| s - 2),
+            last_cell: i32x4::new([grid.size[0] as i32 - 2, grid.size[1] as i32 - 2, grid.size[2] as i32 - 2, 0]),
+            row: grid.size[0],
+            slice: grid.size[0] * grid.size[1],
+        }
     }
 
     #[inline(always)]
@@ -213,9 +220,9 @@ impl Shape {
     /// The cell at a place that is known to lie on the grid, and where in it.
     #[inline(always)]
     pub(super) fn cell_inside(&self, index: f32x4) -> (usize, [f32; 3]) {
-        let [x, y, z, _] = index.to_array();
-        let (i, j, k) = ((x as usize).min(self.cells[0]), (y as usize).min(self.cells[1]), (z as usize).min(self.cells[2]));
-        (k * self.slice + j * self.row + i, [x - i as f32, y - j as f32, z - k as f32])
+        let low = index.fast_trunc_int().min(self.last_cell);
+        let ([x, y, z, _], [i, j, k, _]) = ((index - low.round_float()).to_array(), low.to_array());
+        (k as usize * self.slice + j as usize * self.row + i as usize, [x, y, z])
     }
 
     /// Index of the last node.

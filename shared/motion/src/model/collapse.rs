@@ -106,7 +106,9 @@ impl Collapsed {
         self.inverse_scale = scale;
         let field = Nodes { shape: &self.shape, nodes: &self.forward, scale };
         let (inverter, warm, size) = (&self.inverter, self.warm, self.size);
-        let slow = Inverter { scheme: Scheme::Newton, contraction: 0.0, ..*inverter };
+        let along = f32x4::new([1.0, 0.0, 0.0, 0.0]);
+        // from nothing there is no last change
+        let (to_steps, momentum) = (1.0 / scale, if warm { 1.0 } else { 0.0 });
         let [wx, wy, wz] = inverter.weight;
         // as in the row kernel: the step's length bounds the error of where it leads
         let stop = f32x4::splat(inverter.stop() / inverter.contraction) / f32x4::new([wx, wy, wz, 1.0]);
@@ -119,38 +121,31 @@ impl Collapsed {
                 let (j, k) = ((line % size[1]) as f32, (line / size[1]) as f32);
                 let mut report = CollapseReport::default();
                 for (block, (inverse, ahead)) in inverse.chunks_mut(ROW).zip(ahead.chunks_mut(ROW)).enumerate() {
-                    let target: [f32x4; ROW] = std::array::from_fn(|n| f32x4::new([(block * ROW + n) as f32, j, k, 0.0]));
-                    let mut position = target;
-                    let mut open = 0u32;
-                    for (n, v) in ahead.iter().enumerate() {
-                        let start = target[n] + numbers(*v) * old_scale;
-                        position[n] = target[n] - field.at_once(start);
-                        let settled = (position[n] - start).abs().simd_le(stop).to_bitmask() == 0b1111;
-                        open |= u32::from(!settled) << n;
+                    let first = f32x4::new([(block * ROW) as f32, j, k, 0.0]);
+                    let keep = |v: f32x4, before: f32x4| -> [[i16; 4]; 2] {
+                        let pair: f32x8 = bytemuck::cast([v, v + (v - before) * momentum]);
+                        bytemuck::cast(i16x8::from_i32x8_saturate((pair * to_steps).fast_round_int()))
+                    };
+                    let (mut target, mut open) = (first, 0u32);
+                    let mut position = [f32x4::ZERO; ROW];
+                    for (n, (inverse, ahead)) in inverse.iter_mut().zip(&mut *ahead).enumerate() {
+                        let [before, lead]: [f32x4; 2] = bytemuck::cast(two_nodes([*inverse, *ahead]) * old_scale);
+                        let v = -field.at_once(target + lead);
+                        if (v - lead).abs().simd_le(stop).to_bitmask() == 0b1111 {
+                            [*inverse, *ahead] = keep(v, before);
+                        } else {
+                            open |= 1 << n;
+                            position[n] = target + v;
+                        }
+                        target += along;
                     }
                     report.evaluations += inverse.len() as u64;
-                    while open != 0 {
-                        let n = open.trailing_zeros() as usize;
-                        open &= open - 1;
-                        let mut converged = [false; ROW];
-                        report.evaluations += u64::from(inverter.invert_row(&field, &target, n..n + 1, &mut position, &mut converged));
-                        if !converged[n] {
-                            let lanes = |v: f32x4| -> [f32; 3] { std::array::from_fn(|c| v.to_array()[c]) };
-                            let found = slow.invert(&field, lanes(target[n]), lanes(target[n]));
-                            report.hard += 1;
-                            report.evaluations += u64::from(found.iterations);
-                            report.unsettled += usize::from(!found.converged);
-                            position[n] = f32x4::new([found.position[0], found.position[1], found.position[2], 0.0]);
+                    if open != 0 {
+                        let target: [f32x4; ROW] = std::array::from_fn(|n| first + along * n as f32);
+                        settle(&field, inverter, &target, open, &mut position, &mut report);
+                        for n in (0..inverse.len()).filter(|n| open >> n & 1 == 1) {
+                            [inverse[n], ahead[n]] = keep(position[n] - target[n], numbers(inverse[n]) * old_scale);
                         }
-                    }
-                    let to_steps = 1.0 / scale;
-                    for (n, (inverse, ahead)) in inverse.iter_mut().zip(ahead).enumerate() {
-                        let v = position[n] - target[n];
-                        let before = if warm { numbers(*inverse) * old_scale } else { v };
-                        let pair: [[f32; 4]; 2] = [v.to_array(), (v + v - before).to_array()];
-                        let steps: [[i16; 4]; 2] =
-                            bytemuck::cast(i16x8::from_i32x8_saturate((bytemuck::cast::<_, f32x8>(pair) * to_steps).fast_round_int()));
-                        [*inverse, *ahead] = steps;
                     }
                 }
                 report
@@ -190,6 +185,24 @@ impl Collapsed {
     }
 }
 
+/// Goes on with the nodes of a row that one step did not settle.
+#[cold]
+fn settle(field: &Nodes, inverter: &Inverter, target: &[f32x4; ROW], open: u32, position: &mut [f32x4; ROW], report: &mut CollapseReport) {
+    let slow = Inverter { scheme: Scheme::Newton, contraction: 0.0, ..*inverter };
+    let lanes = |v: f32x4| -> [f32; 3] { std::array::from_fn(|c| v.to_array()[c]) };
+    for n in (0..ROW).filter(|n| open >> n & 1 == 1) {
+        let mut converged = [false; ROW];
+        report.evaluations += u64::from(inverter.invert_row(field, target, n..n + 1, position, &mut converged));
+        if !converged[n] {
+            let found = slow.invert(field, lanes(target[n]), lanes(target[n]));
+            report.hard += 1;
+            report.evaluations += u64::from(found.iterations);
+            report.unsettled += usize::from(!found.converged);
+            position[n] = f32x4::new([found.position[0], found.position[1], found.position[2], 0.0]);
+        }
+    }
+}
+
 /// A field of steps, sampled.
 struct Nodes<'a> {
     shape: &'a Shape,
@@ -209,7 +222,10 @@ impl Nodes<'_> {
     fn at_once(&self, index: f32x4) -> f32x4 {
         let (o, [x, y, z]) = self.shape.cell_inside(index.fast_max(f32x4::ZERO).fast_min(self.shape.last()));
         let (row, slice) = self.shape.strides();
-        let edge = |o: usize| two_nodes([self.nodes[o], self.nodes[o + 1]]);
+        let edge = |o: usize| {
+            let nodes = &self.nodes[o..o + 2];
+            two_nodes([nodes[0], nodes[1]])
+        };
         let mix = |a: f32x8, b: f32x8, t: f32| a + (b - a) * t;
         let near = mix(edge(o), edge(o + row), y);
         let far = mix(edge(o + slice), edge(o + slice + row), y);
