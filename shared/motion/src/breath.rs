@@ -51,8 +51,56 @@ impl Breathing for Still {
     }
 }
 
+/// Keeps a signal where a model may be believed: a cough or a sigh of three breaths' depth would fold tissue.
+///
+/// Within [`Bounded::FREE`] of the usual ends nothing changes; beyond, level runs out smoothly over as much again (w·tanh(e/w), slope 1 at the
+/// joint), and rate with it.
+#[derive(Clone, Debug)]
+pub struct Bounded<B>(pub B);
+
+impl<B> Bounded<B> {
+    /// How far beyond the usual ends nothing changes.
+    pub const FREE: f64 = 0.4;
+}
+
+impl<B: Breathing> Breathing for Bounded<B> {
+    fn at(&self, time_ns: u64) -> Breath {
+        let breath = self.0.at(time_ns);
+        let held = breath.level.clamp(-Self::FREE, 1.0 + Self::FREE);
+        let beyond = ((breath.level - held) / Self::FREE).tanh();
+        Breath { level: held + Self::FREE * beyond, rate: breath.rate * (1.0 - beyond * beyond), ..breath }
+    }
+}
+
 /// Seconds of a time [ns]; exact to a nanosecond for 100 days.
 #[inline]
 pub(crate) fn seconds(time_ns: u64) -> f64 {
     (time_ns / 1_000_000_000) as f64 + (time_ns % 1_000_000_000) as f64 * 1e-9
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Sigh;
+
+    impl Breathing for Sigh {
+        fn at(&self, time_ns: u64) -> Breath {
+            let t = seconds(time_ns);
+            Breath { level: 0.5 - 3.0 * (t * 2.0).cos(), rate: 6.0 * (t * 2.0).sin(), phase: 0.0 }
+        }
+    }
+
+    #[test]
+    fn a_sigh_is_bounded_smoothly_and_a_breath_is_left_alone() {
+        let bounded = Bounded(Sigh);
+        for ms in 0..4000u64 {
+            let (a, b, c) = (bounded.at(ms * 1_000_000), bounded.at(ms * 1_000_000 + 500_000), bounded.at(ms * 1_000_000 + 1_000_000));
+            assert!((-0.8..=1.8).contains(&b.level) && (b.rate - (c.level - a.level) / 1e-3).abs() < 0.01, "{b:?}");
+            let free = Sigh.at(ms * 1_000_000);
+            if (-0.4..=1.4).contains(&free.level) {
+                assert_eq!(a, free);
+            }
+        }
+    }
 }

@@ -17,6 +17,6 @@ pub mod register;
 pub mod resample;
 pub mod signal;
 
-pub use breath::{Breath, Breathing, Still};
+pub use breath::{Bounded, Breath, Breathing, Still};
 pub use error::MotionError;
 pub use model::{Collapsed, Kind, MotionAt, MotionModel, PointInverse, Precision, Weights};
