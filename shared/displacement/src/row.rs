@@ -30,7 +30,7 @@ const ROW_NEWTON: u32 = 6;
 impl Inverter {
     /// Inverts the points `range` of a row, in place from their starts. `converged` tells which met the rule. Returns the number of
     /// field evaluations.
-    #[inline]
+    #[inline(always)]
     pub fn invert_row<const N: usize>(
         &self,
         field: &impl RowField,
@@ -45,7 +45,7 @@ impl Inverter {
         }
     }
 
-    #[inline]
+    #[inline(always)]
     fn fixed_point_row<const N: usize>(
         &self,
         field: &impl RowField,
@@ -58,15 +58,9 @@ impl Inverter {
         let (stop, weight) = (f32x4::splat(self.stop() / self.contraction), weights(self.weight));
         let mut evaluations = range.len() as u32;
         let mut open = 0u64;
-        // every point once, independent of one another; NaN fails the comparison and stays open
-        let step = |position: &mut f32x4, target: f32x4| {
-            let next = target - field.value(*position);
-            let residual = (next - *position).abs() * weight;
-            *position = next;
-            residual.simd_le(stop).to_bitmask() != 0b1111
-        };
+        // every point once, independent of one another
         for n in range.clone() {
-            open |= u64::from(step(&mut position[n], target[n])) << n;
+            open |= u64::from(approach(field, &mut position[n], target[n], weight, stop)) << n;
         }
         // then only those that go on
         for _ in 1..ROW_ITERATIONS {
@@ -78,7 +72,7 @@ impl Inverter {
             while left != 0 {
                 let n = left.trailing_zeros() as usize;
                 left &= left - 1;
-                if !step(&mut position[n], target[n]) {
+                if !approach(field, &mut position[n], target[n], weight, stop) {
                     open &= !(1 << n);
                 }
             }
@@ -89,7 +83,7 @@ impl Inverter {
         evaluations
     }
 
-    #[inline]
+    #[inline(always)]
     fn newton_row<const N: usize>(
         &self,
         field: &impl RowField,
@@ -129,6 +123,15 @@ impl Inverter {
         }
         evaluations
     }
+}
+
+/// One step of the fixed point; whether the point goes on. NaN fails the comparison and goes on.
+#[inline(always)]
+fn approach(field: &impl RowField, position: &mut f32x4, target: f32x4, weight: f32x4, stop: f32x4) -> bool {
+    let next = target - field.value(*position);
+    let residual = (next - *position).abs() * weight;
+    *position = next;
+    residual.simd_le(stop).to_bitmask() != 0b1111
 }
 
 #[inline(always)]

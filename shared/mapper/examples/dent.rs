@@ -1,4 +1,4 @@
-//! Times the mapping of figure 6.2's dent, and of about a million elements, again and again: `dent [ROUNDS]`. For a profiler.
+//! Times the mapping of figure 6.2's dent, and of about a million elements, again and again: `dent [ROUNDS] [CASE]`. For a profiler.
 
 use maille_chainmail::{Admission, ChainMail, Motion, Pin, Tissue};
 use maille_mapper::{MapOptions, Mapper};
@@ -19,7 +19,9 @@ fn main() {
         (&large, 0.1, [103; 3], [0.0, 9.15, 0.0], rounds / 200),
         (&large, 0.2, [103; 3], [12.0, -14.0, 10.0], rounds / 200),
     ];
-    for (rest, offset, corner, step, rounds) in cases {
+    let only: Option<usize> = std::env::args().nth(2).and_then(|v| v.parse().ok());
+    for (rest, offset, corner, step, rounds) in cases.into_iter().enumerate().filter(|(n, _)| only.is_none_or(|o| o == *n)).map(|(_, c)| c)
+    {
         let tissue = Tissue {
             offset,
             density_scaling: false,

@@ -13,7 +13,7 @@
 //! changed voxel are right when [`remap`] returns; the result does not depend on the number of threads. Cost: one small
 //! solve a voxel (2 to 5 field evaluations). Not here: how bricks are committed (the sink's business).
 
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod pieces;
 mod reach;
@@ -22,6 +22,7 @@ mod sample;
 mod search;
 mod solve;
 pub mod tetrahedra;
+mod vector;
 mod window;
 mod write;
 

@@ -180,23 +180,23 @@ impl Cover {
         const EMPTY: [[i16; WIDE]; 2] = [[i16::MAX; WIDE], [i16::MIN; WIDE]];
         let mut in_plane = [EMPTY; EDGE];
         for (k, plane) in in_plane.iter_mut().enumerate().take(high[2] + 1).skip(low[2]) {
-            let mut rows = EMPTY;
+            // REACH more rows on either side, so that a shift is another start
+            let mut rows = [[i16::MAX; WIDE + 2 * REACH], [i16::MIN; WIDE + 2 * REACH]];
             for j in low[1]..=high[1] {
                 let [a, b] = changed.spans[k * EDGE + j];
                 if b > 0 {
-                    (rows[0][j + REACH], rows[1][j + REACH]) = (i16::from(a) + by[0][0] as i16, i16::from(b) + by[0][1] as i16);
+                    (rows[0][j + 2 * REACH], rows[1][j + 2 * REACH]) = (i16::from(a) + by[0][0] as i16, i16::from(b) + by[0][1] as i16);
                 }
             }
             for shift in by[1][0]..=by[1][1] {
-                // row j goes to j + shift; what a shift carries round the end is empty: spans lie REACH inside
-                let mut moved = rows;
-                for ends in &mut moved {
-                    ends.rotate_right(shift.rem_euclid(WIDE as isize) as usize);
-                }
-                union(plane, &moved);
+                // row j goes to j + shift
+                let from = (REACH as isize - shift) as usize;
+                let ends = |side: usize| rows[side][from..].first_chunk::<WIDE>().expect("shifts stay within reach");
+                union(plane, [ends(0), ends(1)]);
             }
         }
         let ends = |c: usize| low[c] as isize + by[c][0]..=high[c] as isize + by[c][1];
+        let mut places = [usize::MAX; 27];
         for z in ends(2) {
             let voxel_k = first[2] as isize + z;
             if voxel_k < 0 || voxel_k >= layout.size[2] as isize {
@@ -204,7 +204,8 @@ impl Cover {
             }
             let mut rows = EMPTY;
             for k in (z - by[2][1]).max(low[2] as isize)..=(z - by[2][0]).min(high[2] as isize) {
-                union(&mut rows, &in_plane[k as usize]);
+                let [a, b] = &in_plane[k as usize];
+                union(&mut rows, [a, b]);
             }
             for y in ends(1) {
                 let (voxel_j, at) = (first[1] as isize + y, (y + REACH as isize) as usize);
@@ -215,7 +216,14 @@ impl Cover {
                 }
                 let (a, b, j, k) = (a as usize, b as usize, voxel_j as usize, voxel_k as usize);
                 for brick in a / EDGE..=(b - 1) / EDGE {
-                    let place = self.place_mut(layout.id([brick, j / EDGE, k / EDGE]));
+                    let at = [brick, j / EDGE, k / EDGE];
+                    // spans reach no further than the neighbours
+                    let step = |c: usize| at[c] + 1 - first[c] / EDGE;
+                    let near = &mut places[(step(2) * 3 + step(1)) * 3 + step(0)];
+                    if *near == usize::MAX {
+                        *near = self.place_mut(layout.id(at));
+                    }
+                    let place = *near;
                     let (from, to) = (a.max(brick * EDGE) - brick * EDGE, b.min(brick * EDGE + EDGE) - brick * EDGE);
                     extend(&mut self.spans[place][k % EDGE * EDGE + j % EDGE], [from as u8, to as u8]);
                 }
@@ -287,8 +295,8 @@ fn dilation(u: Range) -> Option<[[isize; 2]; 3]> {
 }
 
 /// Union of spans, row by row.
-#[inline]
-fn union(to: &mut [[i16; WIDE]; 2], from: &[[i16; WIDE]; 2]) {
+#[inline(always)]
+fn union(to: &mut [[i16; WIDE]; 2], from: [&[i16; WIDE]; 2]) {
     for n in 0..WIDE {
         to[0][n] = to[0][n].min(from[0][n]);
         to[1][n] = to[1][n].max(from[1][n]);
@@ -320,14 +328,24 @@ fn extend(span: &mut [u8; 2], [low, high]: [u8; 2]) {
 
 /// Box around the spans of a brick (inclusive); `None`: they are empty.
 pub fn bounds(spans: &Spans) -> Option<([usize; 3], [usize; 3])> {
-    let (mut low, mut high, mut any) = ([EDGE; 3], [0; 3], false);
-    for row in (0..ROWS).filter(|&r| spans[r][1] > 0) {
-        let (a, b) = ([spans[row][0] as usize, row % EDGE, row / EDGE], [spans[row][1] as usize - 1, row % EDGE, row / EDGE]);
-        for c in 0..3 {
-            low[c] = low[c].min(a[c]);
-            high[c] = high[c].max(b[c]);
+    // by lanes: an empty span ends at 0
+    let (mut first, mut end) = ([i16::MAX; EDGE], [0i16; EDGE]);
+    let mut planes = [usize::MAX, 0];
+    for (k, rows) in spans.as_chunks::<EDGE>().0.iter().enumerate() {
+        let mut any = [0; EDGE];
+        for j in 0..EDGE {
+            let span = u16::from_le_bytes(rows[j]);
+            let (a, b) = ((span & 0xff) as i16, (span >> 8) as i16);
+            first[j] = first[j].min(if b == 0 { i16::MAX } else { a });
+            end[j] = end[j].max(b);
+            any[j] = b;
         }
-        any = true;
+        if any != [0; EDGE] {
+            planes = [planes[0].min(k), k];
+        }
     }
-    any.then_some((low, high))
+    let rows = [end.iter().position(|&b| b > 0)?, end.iter().rposition(|&b| b > 0)?];
+    let least = first.iter().fold(i16::MAX, |l, &a| l.min(a)) as usize;
+    let most = end.iter().fold(0, |h, &b| h.max(b)) as usize;
+    Some(([least, rows[0], planes[0]], [most - 1, rows[1], planes[1]]))
 }

@@ -11,6 +11,7 @@ use crate::{
     rows::{Box3, ROWS, Spans, bounds},
     sample::{RestSampler, Sampling},
     search::{self, Open, OpenVoxels},
+    vector::{Task, widest},
     window::Window,
 };
 use maille_chainmail::{ChainMail, DisplacementBrick};
@@ -21,13 +22,22 @@ use wide::f32x4;
 /// Stored values of a brick's voxels; only those in the wanted spans mean something.
 pub type Values = [i16; EDGE * EDGE * EDGE];
 
+/// Two planes of rows by turns, so that they stay in the nearest cache.
+type Found = [[f32x4; EDGE]; 2 * EDGE];
+
+/// Where a row of a brick is kept.
+#[inline(always)]
+const fn kept(row: usize) -> usize {
+    row % (2 * EDGE)
+}
+
 /// Working memory of one thread.
 pub struct Workspace {
     pub window: Window,
     /// rows to be solved
     open: Box<Spans>,
-    /// x − X of the rows solved [voxels]
-    found: Box<[[f32x4; EDGE]; ROWS]>,
+    /// x − X of the rows solved [voxels] in this plane of rows and the one before: [`kept`]
+    found: Box<Found>,
     /// tissue and cuts around, where there are any
     pieces: Pieces,
     /// voxels left to the search of cells
@@ -39,7 +49,7 @@ impl Workspace {
         Self {
             window: Window::new(),
             open: Box::new([[0; 2]; ROWS]),
-            found: Box::new([[f32x4::ZERO; EDGE]; ROWS]),
+            found: Box::new([[f32x4::ZERO; EDGE]; 2 * EDGE]),
             pieces: Pieces::default(),
             left: OpenVoxels::new(),
         }
@@ -75,6 +85,11 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
 
     /// Solves the wanted voxels of a brick.
     pub fn brick(&self, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
+        widest(Job { solver: self, work, id, spans, values })
+    }
+
+    #[inline(always)]
+    fn solve(&self, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
         let mut report = MapReport::default();
         let first = self.mail.layout().first_voxel(id);
         let displacement = self.mail.displacement_brick(id).filter(|_| self.mail.displacement_range(id) != [[0.0; 2]; 3]);
@@ -128,16 +143,13 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             guess(open, found, own, row, range.clone(), &target, &mut position);
             report.iterations += u64::from(self.inverter.invert_row(window, &target, range.clone(), &mut position, &mut converged));
             for i in range.clone() {
-                found[row][i] = target[i] - position[i];
+                found[kept(row)][i] = target[i] - position[i];
             }
             // 3. values. X = x is the exact pre-image of what did not move; the kernel stops within its tolerance of it
             let still = |i: usize| f32x4::new(own[i - range.start]).simd_eq(f32x4::ZERO).to_bitmask() == 0b1111;
             if all_linked && linear && converged[range.clone()].iter().all(|&c| c) {
-                for i in range.clone().filter(|&i| !still(i)) {
-                    let value = sampler.linear(position[i]);
-                    report.voids += u64::from(value.is_none());
-                    out[i] = value.unwrap_or(self.void);
-                }
+                let moved = range.clone().fold(0, |bits, i| bits | u32::from(!still(i)) << i);
+                report.voids += sampler.linear_row(&position, moved, self.void, out);
                 continue;
             }
             // the few that did not converge, and what lies beside voids and cuts, are left
@@ -218,8 +230,25 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
     }
 }
 
+/// A brick to be solved.
+struct Job<'a, 'b, S: BrickSource + ?Sized> {
+    solver: &'b Solver<'a, S>,
+    work: &'b mut Workspace,
+    id: BrickId,
+    spans: &'b Spans,
+    values: &'b mut Values,
+}
+
+impl<S: BrickSource + ?Sized> Task for Job<'_, '_, S> {
+    type Output = MapReport;
+    #[inline(always)]
+    fn run(self) -> MapReport {
+        self.solver.solve(self.work, self.id, self.spans, self.values)
+    }
+}
+
 /// The part of a span of a brick's row between its first and its last moved element.
-#[inline]
+#[inline(always)]
 fn moved_span(displacement: &DisplacementBrick, row: usize, [from, to]: [u8; 2]) -> [u8; 2] {
     if to == 0 {
         return [0; 2];
@@ -235,10 +264,10 @@ fn moved_span(displacement: &DisplacementBrick, row: usize, [from, to]: [u8; 2])
 }
 
 /// Where a row starts: by the rows before it; where those are not there, by the voxels' own displacements.
-#[inline]
+#[inline(always)]
 fn guess(
     spans: &Spans,
-    found: &[[f32x4; EDGE]; ROWS],
+    found: &Found,
     own: &[[f32; 4]],
     row: usize,
     range: std::ops::Range<usize>,
@@ -262,7 +291,7 @@ fn guess(
     if common.is_empty() {
         return;
     }
-    let (below, before, corner) = (&found[row - 1], &found[row - EDGE], &found[row - EDGE - 1]);
+    let (below, before, corner) = (&found[kept(row - 1)], &found[kept(row - EDGE)], &found[kept(row - EDGE - 1)]);
     for i in common {
         position[i] = target[i] - (below[i] + before[i] - corner[i]);
     }

@@ -43,6 +43,7 @@ impl Window {
     }
 
     /// Copies the elements of a box (inclusive, inside the volume).
+    #[inline(always)]
     pub fn gather(&mut self, mail: &ChainMail, range: Box3) {
         let layout = mail.layout();
         self.low = range.low;
@@ -74,6 +75,7 @@ impl Window {
     }
 
     /// Copies the part of one brick that lies in the window; `None`: it is at rest.
+    #[inline(always)]
     fn copy_brick(&mut self, brick: Option<&DisplacementBrick>, per_mm: f32x4, first: [usize; 3], range: Box3) {
         let part = |c: usize| first[c].max(range.low[c])..(first[c] + EDGE).min(range.high[c] + 1);
         let (from, count) = (part(0).start, part(0).len());

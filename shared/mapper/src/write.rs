@@ -5,11 +5,13 @@ use crate::{
     BrickSink,
     rows::{Cover, bounds},
     solve::Values,
+    vector::{Task, widest},
 };
 use maille_volume::{
     BrickId, BrickLayout,
     brick::{APRON_HIGH, APRON_LOW, Brick, EDGE, STORED_EDGE},
 };
+use std::ops::Range;
 
 /// Stored voxels along an axis that copy consecutive voxels of one brick.
 #[derive(Clone, Copy)]
@@ -56,9 +58,10 @@ impl Pieces {
 /// Edits the bricks that show a solved voxel with a new value; their numbers, ascending.
 pub fn write<K: BrickSink + ?Sized>(layout: &BrickLayout, wanted: &Cover, values: &[Values], sink: &mut K) -> Vec<BrickId> {
     let mut showing = Vec::with_capacity(4 * wanted.ids.len());
-    for (id, spans) in wanted.ids.iter().zip(&wanted.spans) {
+    let boxes: Vec<_> = wanted.spans.iter().map(bounds).collect();
+    for (id, bounds) in wanted.ids.iter().zip(&boxes) {
         let first = layout.first_voxel(*id);
-        let Some((low, high)) = bounds(spans) else { continue };
+        let Some((low, high)) = bounds else { continue };
         let ranges = layout.bricks_showing(std::array::from_fn(|c| first[c] + low[c]), std::array::from_fn(|c| first[c] + high[c]));
         for k in ranges[2].clone() {
             for j in ranges[1].clone() {
@@ -71,54 +74,141 @@ pub fn write<K: BrickSink + ?Sized>(layout: &BrickLayout, wanted: &Cover, values
     showing.retain(|&id| {
         let at = layout.coordinates(id);
         let pieces = std::array::from_fn(|c| Pieces::new(at[c], layout.size[c]));
-        let offset = |[i, j, k]: [isize; 3]| Brick::offset(i, j, k);
+        let source = Source { layout, wanted, values, boxes: &boxes, pieces: &pieces };
         // a brick that shows no new value is not touched
-        let same = |old: &Brick, to: usize, new: &[i16]| old.voxels[to..to + new.len()] == *new;
-        if sink.current(id).is_some_and(|old| visit(layout, wanted, values, &pieces, |at, new| same(old, offset(at), new))) {
+        if sink.current(id).is_some_and(|old| widest(Compare { source, old })) {
             return false;
         }
-        let brick = sink.edit(id);
-        let (mut low, mut high) = ([isize::MAX; 3], [isize::MIN; 3]);
-        visit(layout, wanted, values, &pieces, |at, new| {
-            let to = offset(at);
-            brick.voxels[to..to + new.len()].copy_from_slice(new);
-            let last = [at[0] + new.len() as isize - 1, at[1], at[2]];
-            (low, high) = (std::array::from_fn(|c| low[c].min(at[c])), std::array::from_fn(|c| high[c].max(last[c])));
-            true
-        });
-        brick.summarise_part(low, high);
+        widest(Copy { source, brick: sink.edit(id) });
         true
     });
     showing
 }
 
-/// Shows `see` every run of solved values and its first place in the brick, until it says no; whether it never did.
-fn visit(
-    layout: &BrickLayout,
-    wanted: &Cover,
-    values: &[Values],
-    pieces: &[Pieces; 3],
-    mut see: impl FnMut([isize; 3], &[i16]) -> bool,
-) -> bool {
-    for z in pieces[2].iter() {
-        for y in pieces[1].iter() {
-            for x in pieces[0].iter() {
-                let Some(place) = wanted.place(layout.id([x.brick, y.brick, z.brick])) else { continue };
-                let (spans, values) = (&wanted.spans[place], values[place].as_chunks::<EDGE>().0);
-                for k in 0..z.count {
-                    for j in 0..y.count {
-                        let row = (z.from + k) * EDGE + y.from + j;
-                        let (a, b) = (x.from.max(spans[row][0] as usize), (x.from + x.count).min(spans[row][1] as usize));
-                        if a < b {
-                            let at = [x.to + (a - x.from) as isize, y.to + j as isize, z.to + k as isize];
-                            if !see(at, &values[row][a..b]) {
-                                return false;
+/// Solved voxels, and where one brick shows them.
+#[derive(Clone, Copy)]
+struct Source<'a> {
+    layout: &'a BrickLayout,
+    wanted: &'a Cover,
+    values: &'a [Values],
+    /// around the spans of each brick of `wanted`
+    boxes: &'a [Option<([usize; 3], [usize; 3])>],
+    pieces: &'a [Pieces; 3],
+}
+
+/// Whether a brick shows all solved values already.
+struct Compare<'a> {
+    source: Source<'a>,
+    old: &'a Brick,
+}
+
+impl Task for Compare<'_> {
+    type Output = bool;
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.source.visit(|at, row, part| {
+            let (to, stored) = (Brick::offset(at[0], at[1], at[2]), &self.old.voxels);
+            match row[part.clone()] {
+                [a] => stored[to] == a,
+                [a, b] => stored[to] == a && stored[to + 1] == b,
+                _ => match stored.get(to.wrapping_sub(part.start)..).and_then(|v| v.first_chunk::<EDGE>()) {
+                    Some(stored) => {
+                        let inside = inside(&part);
+                        (0..EDGE).fold(0, |different, i| different | (stored[i] ^ row[i]) & inside[i]) == 0
+                    }
+                    None => stored[to..to + part.len()] == row[part],
+                },
+            }
+        })
+    }
+}
+
+/// For each number of voxels all bits where one of a row comes before it.
+static BEFORE: [[i16; EDGE]; EDGE + 1] = {
+    let (mut out, mut n) = ([[0; EDGE]; EDGE + 1], 0);
+    while n <= EDGE {
+        let mut i = 0;
+        while i < n {
+            out[n][i] = -1;
+            i += 1;
+        }
+        n += 1;
+    }
+    out
+};
+
+/// All bits where a row's voxel is in the part.
+#[inline(always)]
+fn inside(part: &Range<usize>) -> [i16; EDGE] {
+    let (from, until) = (&BEFORE[part.start], &BEFORE[part.end]);
+    std::array::from_fn(|i| until[i] & !from[i])
+}
+
+/// Writes solved values into a brick.
+struct Copy<'a> {
+    source: Source<'a>,
+    brick: &'a mut Brick,
+}
+
+impl Task for Copy<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { source, brick } = self;
+        let (mut low, mut high) = ([isize::MAX; 3], [isize::MIN; 3]);
+        source.visit(|at, row, part| {
+            let to = Brick::offset(at[0], at[1], at[2]);
+            let last = [at[0] + part.len() as isize - 1, at[1], at[2]];
+            (low, high) = (std::array::from_fn(|c| low[c].min(at[c])), std::array::from_fn(|c| high[c].max(last[c])));
+            match row[part.clone()] {
+                [a] => brick.voxels[to] = a,
+                [a, b] => (brick.voxels[to], brick.voxels[to + 1]) = (a, b),
+                _ => match brick.voxels.get_mut(to.wrapping_sub(part.start)..).and_then(|v| v.first_chunk_mut::<EDGE>()) {
+                    // the whole row at once; beside the part the brick keeps what it has
+                    Some(stored) => {
+                        let inside = inside(&part);
+                        for i in 0..EDGE {
+                            stored[i] ^= (stored[i] ^ row[i]) & inside[i];
+                        }
+                    }
+                    None => brick.voxels[to..to + part.len()].copy_from_slice(&row[part]),
+                },
+            }
+            true
+        });
+        brick.summarise_part(low, high);
+    }
+}
+
+impl Source<'_> {
+    /// Shows `see` every run of solved values, as a part of a row, and its first place in the brick, until it says no; whether it
+    /// never did.
+    #[inline(always)]
+    fn visit(&self, mut see: impl FnMut([isize; 3], &[i16; EDGE], Range<usize>) -> bool) -> bool {
+        for z in self.pieces[2].iter() {
+            for y in self.pieces[1].iter() {
+                for x in self.pieces[0].iter() {
+                    let Some(place) = self.wanted.place(self.layout.id([x.brick, y.brick, z.brick])) else { continue };
+                    let Some((low, high)) = self.boxes[place] else { continue };
+                    if x.from > high[0] || x.from + x.count <= low[0] {
+                        continue;
+                    }
+                    let (spans, values) = (&self.wanted.spans[place], self.values[place].as_chunks::<EDGE>().0);
+                    for k in z.from.max(low[2])..(z.from + z.count).min(high[2] + 1) {
+                        for j in y.from.max(low[1])..(y.from + y.count).min(high[1] + 1) {
+                            let row = k * EDGE + j;
+                            let (a, b) = (x.from.max(spans[row][0] as usize), (x.from + x.count).min(spans[row][1] as usize));
+                            if a < b {
+                                let to = |p: &Piece, v: usize| p.to + v as isize - p.from as isize;
+                                if !see([to(x, a), to(y, j), to(z, k)], &values[row], a..b) {
+                                    return false;
+                                }
                             }
                         }
                     }
                 }
             }
         }
+        true
     }
-    true
 }
