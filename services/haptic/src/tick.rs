@@ -148,6 +148,7 @@ impl<'a> Loop<'a> {
                 radius_mm: m.radius_mm,
             };
             self.outbox.moves.store(&message);
+            // the tick's only system call, where the publisher sleeps: FUTEX_WAKE, which never waits
             self.publisher.unpark();
         }
     }

@@ -16,6 +16,8 @@
 //! | `services.S.killed` | it did not end within 1 s when asked |
 //! | `services.haptic.rate_hz`, `overruns` | ticks a second after warm-up; releases missed and not caught up |
 //! | `services.haptic.tick_us`, `lateness_us` | compute of a tick; how late it began: `p50`, `p99`, `p999`, `max` |
+//! | `services.haptic.tick_histogram`, `lateness_histogram` | the same as pairs: up to so many µs (null: more than all), how many ticks |
+//! | `services.haptic.ticks`, `contact_share` | ticks after warm-up; part of them in contact |
 //! | `services.haptic.in_contact`, `degraded`, `allocations`, `realtime` | ticks in contact; ticks in a fallback; allocations in ticks; whether real-time rights were had |
 //! | `services.deformation.commits`, `moved_elements` | transactions; elements moved, summed over them |
 //! | `services.deformation.step_us` | from a tool move to its commit |
@@ -30,7 +32,7 @@ use crate::{memory::MIB, watch::Post};
 use maille_contract::{
     ControlBlock, Role, ServiceCell,
     control::Counter,
-    histogram::{Percentiles, SharedHistogram},
+    histogram::{Percentiles, SharedHistogram, lower},
 };
 use serde::Serialize;
 use std::{collections::BTreeMap, fmt, sync::atomic::Ordering::Relaxed};
@@ -55,6 +57,21 @@ impl Durations {
     }
 }
 
+/// Upper bounds of the histogram that people read [µs].
+const UP_TO_US: [u64; 16] = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000];
+
+/// How many durations up to each bound and above the one before; what is longer than all bounds comes last, without one. Each duration is
+/// counted where its bucket begins, at most 3 % below it.
+type Histogram = Vec<(Option<u64>, u64)>;
+
+fn histogram(of: &SharedHistogram) -> Histogram {
+    let mut rows: Histogram = UP_TO_US.iter().map(|&us| (Some(us), 0)).chain([(None, 0)]).collect();
+    for (bucket, count) in of.counts().into_iter().enumerate() {
+        rows[UP_TO_US.partition_point(|&us| us * 1000 < lower(bucket))].1 += count;
+    }
+    rows
+}
+
 /// Of the haptic process.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -63,6 +80,10 @@ pub struct HapticReport {
     pub overruns: u64,
     pub tick_us: Durations,
     pub lateness_us: Durations,
+    pub tick_histogram: Histogram,
+    pub lateness_histogram: Histogram,
+    pub ticks: u64,
+    pub contact_share: f64,
     pub in_contact: u64,
     pub degraded: u64,
     pub allocations: u64,
@@ -166,6 +187,10 @@ fn own(role: Role, cell: &ServiceCell) -> Own {
             overruns: n(Counter::Overruns),
             tick_us: Durations::of(&cell.duration, 1e3),
             lateness_us: Durations::of(&cell.lateness, 1e3),
+            tick_histogram: histogram(&cell.duration),
+            lateness_histogram: histogram(&cell.lateness),
+            ticks: n(Counter::Iterations),
+            contact_share: n(Counter::InContact) as f64 / n(Counter::Iterations).max(1) as f64,
             in_contact: n(Counter::InContact),
             degraded: n(Counter::Degraded),
             allocations: n(Counter::Allocations),
@@ -209,8 +234,14 @@ impl fmt::Display for RunReport {
         writeln!(f, "{:<12} {:>8} {:>8} {:>11} {:>10}  ", "service", "pid", "restarts", "private MiB", "rate Hz")?;
         for (name, s) in &self.services {
             let (rate, notes) = match &s.own {
-                Own::Haptic(h) => (format!("{:.1}", h.rate_hz), format!("{} overruns, {} ticks in contact", h.overruns, h.in_contact)),
-                Own::Deformation(d) => ("".into(), format!("{} commits, {} elements moved", d.commits, d.moved_elements)),
+                Own::Haptic(h) => {
+                    let share = 100.0 * h.contact_share;
+                    (format!("{:.1}", h.rate_hz), format!("{} overruns, {share:.1} % of {} ticks in contact", h.overruns, h.ticks))
+                }
+                Own::Deformation(d) => {
+                    let rate = format!("{:.1}", d.commits as f64 / self.duration_s.max(1e-9));
+                    (rate, format!("{} commits, {} elements moved", d.commits, d.moved_elements))
+                }
                 Own::Rendering(r) => (format!("{:.1}", r.rate_hz), format!("{} frames", r.frames)),
                 Own::Console {} => Default::default(),
             };
@@ -227,6 +258,13 @@ impl fmt::Display for RunReport {
                 Own::Deformation(d) => writeln!(f, "{:<24} {}", "deformation step µs", row(&d.step_us))?,
                 Own::Rendering(r) => writeln!(f, "{:<24} {}", "rendering frame ms", row(&r.frame_ms))?,
                 Own::Console {} => {}
+            }
+        }
+        if let Some(Own::Haptic(h)) = self.services.get(Role::Haptic.word()).map(|s| &s.own) {
+            writeln!(f, "\n{:<24} {:>9} {:>9}", "haptic, up to", "tick", "lateness")?;
+            for ((bound, tick), (_, late)) in h.tick_histogram.iter().zip(&h.lateness_histogram).filter(|(a, b)| a.1 + b.1 > 0) {
+                let bound = bound.map_or("more".into(), |us| format!("{us} µs"));
+                writeln!(f, "{bound:>24} {tick:>9} {late:>9}")?;
             }
         }
         let low = self.store.spare_slots_low.map_or("all".into(), |low| low.to_string());
@@ -264,7 +302,7 @@ mod tests {
         for service in ["haptic", "deformation", "rendering"] {
             paths.extend(["pid", "restarts", "private_mib"].map(|key| format!("/services/{service}/{key}")));
         }
-        paths.extend(["rate_hz", "overruns"].map(|key| format!("/services/haptic/{key}")));
+        paths.extend(["rate_hz", "overruns", "ticks", "contact_share", "lateness_histogram"].map(|key| format!("/services/haptic/{key}")));
         paths.extend(["commits", "moved_elements"].map(|key| format!("/services/deformation/{key}")));
         paths.push("/services/rendering/frames".into());
         for histogram in ["haptic/tick_us", "haptic/lateness_us", "deformation/step_us", "rendering/frame_ms"] {
@@ -285,11 +323,16 @@ mod tests {
         haptic.count(Counter::Iterations, 9_000);
         haptic.count(Counter::RecordedNs, 9_000_000_000);
         haptic.duration.record(25_000);
+        haptic.lateness.record(2_000_000_000);
+        haptic.count(Counter::InContact, 4_500);
         control.service(Role::Rendering).duration.record(30_000_000);
         let json = report(&control);
         let number = |path: &str| json.pointer(path).unwrap().as_f64().unwrap();
         assert_eq!(number("/services/haptic/rate_hz"), 1000.0);
         assert_eq!(number("/services/haptic/tick_us/max"), 25.0);
         assert_eq!(number("/services/rendering/frame_ms/max"), 30.0);
+        assert_eq!(number("/services/haptic/contact_share"), 0.5);
+        assert_eq!(json["services"]["haptic"]["tick_histogram"][5], serde_json::json!([50, 1]), "25 µs are above 20 and not above 50");
+        assert_eq!(json["services"]["haptic"]["lateness_histogram"][16], serde_json::json!([null, 1]));
     }
 }

@@ -67,9 +67,14 @@ impl SharedHistogram {
         }
     }
 
+    /// Counts of all buckets, in order; for differences over time and for histograms that people read.
+    pub fn counts(&self) -> Vec<u64> {
+        self.counts.iter().map(|c| c.load(Relaxed)).collect()
+    }
+
     /// Percentiles of what was recorded: the middle of the bucket where each falls.
     pub fn percentiles(&self) -> Percentiles {
-        let counts: Vec<u64> = self.counts.iter().map(|c| c.load(Relaxed)).collect();
+        let counts = self.counts();
         let count: u64 = counts.iter().sum();
         if count == 0 {
             return Percentiles::default();

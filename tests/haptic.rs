@@ -1,0 +1,226 @@
+//! The haptic process in whole runs: what its loop asks of the system, seen from outside; a real device's way to it and back; and the hand
+//! while another process is frozen. Kills are `fault_injection`'s matter.
+//!
+//! `MAILLE_SECONDS=60 cargo test --test haptic system -- --nocapture` watches the loop for a minute.
+
+#[path = "../services/supervisor/tests/support/mod.rs"]
+#[allow(dead_code)] // shared with other tests, which use other parts
+mod support;
+
+#[path = "fault_injection/device.rs"]
+mod device;
+#[path = "haptic/service.rs"]
+mod service;
+
+use device::{drive, norm, steps};
+use maille_contact::Grip;
+use maille_contract::{Role, ServiceState, ToolState, messages::TOOL_FADING};
+use maille_scene::{BoxMm, Scene};
+use maille_store::{FREE_PINS, Reader};
+use maille_transport::{ControlMap, Domain, monotonic_ns};
+use maille_volume::Sampler;
+use rustix::process::Signal;
+use service::Service;
+use std::{
+    collections::BTreeMap,
+    fs,
+    process::{Command, Stdio},
+    sync::atomic::{AtomicBool, Ordering::Relaxed},
+    time::Duration,
+};
+use support::{Run, SMALL_SCENE, Scratch, eventually, left_over, report, signal};
+
+/// The default scene's limit of change, 100 N/s, in a tick of 1 ms; and rounding [N].
+const STEP_N: f64 = 0.1 + 1e-9;
+
+fn number(name: &str, otherwise: u64) -> u64 {
+    std::env::var(name).map_or(otherwise, |text| text.parse().unwrap_or_else(|_| panic!("{name} is a number, not {text:?}")))
+}
+
+/// A small scene whose tissue comes back, so that each press finds some.
+fn pressing(device: &str, more: &str) -> String {
+    SMALL_SCENE
+        .replace("[tool]\n", &format!("[tool]\ndevice = \"{device}\"\n"))
+        .replace("press_mm = 4.0\nperiod_s = 1.0", "press_mm = 8.0\nperiod_s = 1.7")
+        .replace("deformation = true", "deformation = true\nrelaxation = true")
+        + "[deformation]\nrelaxation_s = 0.2\n"
+        + more
+}
+
+/// A run of a scene, its domain and its control block, all services ready.
+fn started(scratch: &Scratch, scene: &str, more: &[&str]) -> (Run, Domain, ControlMap) {
+    let path = scratch.write("scene.toml", scene);
+    let run = Run::start(Command::new(env!("CARGO_BIN_EXE_maille")).arg("run").arg(path).arg("--headless").args(more));
+    let domain = Domain::named(&run.domain()).expect("the run's domain");
+    let control = ControlMap::open(&domain).expect("its control block");
+    for role in [Role::Haptic, Role::Deformation, Role::Rendering] {
+        eventually("a service is ready", || control.service(role).state() == ServiceState::Ready);
+    }
+    (run, domain, control)
+}
+
+fn ended(mut run: Run, domain: &Domain) {
+    signal(run.pid(), Signal::TERM);
+    assert!(run.wait().success(), "{}", run.printed());
+    assert_eq!(left_over(domain.name()), [""; 0]);
+}
+
+fn tool(control: &ControlMap) -> ToolState {
+    control.tool.load::<ToolState>().map(|(tool, _)| tool).expect("haptic has said something")
+}
+
+/// The thread of the loop asks the system for its sleep, and to wake the publisher's thread; the latter never waits. Readings of the clock
+/// are no system calls.
+#[test]
+fn the_loop_allocates_nothing_and_asks_the_system_for_nothing_that_can_block() {
+    let found = Command::new("strace").arg("-V").stdout(Stdio::null()).stderr(Stdio::null()).status();
+    if !found.is_ok_and(|status| status.success()) {
+        println!("SKIPPED: strace is not installed, the loop's system calls were not watched");
+        return;
+    }
+    let scratch = Scratch::new("haptic-calls");
+    let (path, trace) = (scratch.file("run.json"), scratch.file("strace.txt"));
+    let (run, domain, control) = started(&scratch, &pressing("path", ""), &["--report", path.to_str().expect("a path in UTF-8")]);
+    // what is opened at the start is over, and the loop's own guard counts from here on as well
+    std::thread::sleep(Duration::from_millis(1_200));
+    let pid = control.service(Role::Haptic).pid.load(Relaxed).to_string();
+    // the first thread of the process is the loop's; no other is followed
+    let mut strace = Command::new("strace").args(["-p", &pid, "-o"]).arg(&trace).stderr(Stdio::piped()).spawn().expect("strace starts");
+    let seconds = number("MAILLE_SECONDS", 3);
+    for _ in 0..seconds * 10 {
+        std::thread::sleep(Duration::from_millis(100));
+        if strace.try_wait().expect("it is a child").is_some() {
+            println!(
+                "SKIPPED: strace may not attach here ({:?})",
+                strace.wait_with_output().map(|o| String::from_utf8_lossy(&o.stderr).into_owned())
+            );
+            return ended(run, &domain);
+        }
+    }
+    signal(strace.id(), Signal::INT);
+    strace.wait().expect("it is a child");
+    drop(control);
+    ended(run, &domain);
+
+    let mut calls: BTreeMap<String, u64> = BTreeMap::new();
+    for line in fs::read_to_string(&trace).expect("strace has written").lines() {
+        let name = line.split(['(', ' ']).next().unwrap_or("").to_owned();
+        let can_block = match name.as_str() {
+            "clock_nanosleep" => !line.contains("TIMER_ABSTIME"),
+            "futex" => !line.contains("FUTEX_WAKE"),
+            // the sleep that was under way when strace came, and strace's own stop
+            "restart_syscall" | "---" => false,
+            _ => true,
+        };
+        assert!(!can_block, "the loop made this call: {line}");
+        *calls.entry(name).or_default() += 1;
+    }
+    let report = report(&path);
+    println!("{seconds} s: system calls of the loop's thread {calls:?}; allocations {}", report["services"]["haptic"]["allocations"]);
+    assert!(calls.get("clock_nanosleep").is_some_and(|&n| n > 100 * seconds), "the loop was watched: {calls:?}");
+    assert!(calls.contains_key("futex"), "tool moves were handed over: {calls:?}");
+    assert_eq!(report["services"]["haptic"]["allocations"], 0);
+}
+
+/// Processes that stand still for 100 ms, as a machine that swaps or a debugger makes them.
+#[test]
+fn a_hand_feels_no_step_while_deformation_or_rendering_is_frozen() {
+    let scratch = Scratch::new("haptic-frozen");
+    let (run, domain, control) = started(&scratch, &pressing("external", ""), &[]);
+    let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
+    let scene = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
+    let rest = reader.rest();
+    let sampler = Sampler::new(&rest);
+    let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let stop = AtomicBool::new(false);
+    /// Ends the device also when the test fails.
+    struct Stop<'a>(&'a AtomicBool);
+    impl Drop for Stop<'_> {
+        fn drop(&mut self) {
+            self.0.store(true, Relaxed);
+        }
+    }
+    let (felt, freezes) = std::thread::scope(|scope| {
+        let ending = Stop(&stop);
+        let hand = scope.spawn(|| drive(&control, &way, Grip::FULL, &stop));
+        eventually("tissue gives way to the hand", || reader.epoch() > 2);
+        let freezes: Vec<(u64, u64, f64)> = (0..number("MAILLE_FREEZES", 6))
+            .map(|n| {
+                std::thread::sleep(Duration::from_millis(400 + n * 377 % 600));
+                eventually("the hand presses", || norm(tool(&control).force_n) > 0.2);
+                let role = if n % 3 == 2 { Role::Rendering } else { Role::Deformation };
+                let pid = control.service(role).pid.load(Relaxed) as u32;
+                let (from, force_n) = (monotonic_ns(), norm(tool(&control).force_n));
+                signal(pid, Signal::STOP);
+                std::thread::sleep(Duration::from_millis(5));
+                let epoch = reader.epoch();
+                std::thread::sleep(Duration::from_millis(95));
+                assert!(role != Role::Deformation || reader.epoch() == epoch, "what is frozen commits nothing");
+                signal(pid, Signal::CONT);
+                std::thread::sleep(Duration::from_millis(300));
+                (from, monotonic_ns(), force_n)
+            })
+            .collect();
+        drop(ending);
+        (hand.join().expect("the device works"), freezes)
+    });
+    drop((reader, control));
+    ended(run, &domain);
+    for (from, to, force_n) in &freezes {
+        let within = || steps(&felt).filter(|(at, _)| (from..to).contains(&at));
+        let largest = within().map(|(_, step)| step).fold(0.0, f64::max);
+        println!("frozen for 100 ms at {force_n:.2} N: at most {largest:.4} N a tick in {} ticks, to 0.3 s after", within().count());
+        assert!(within().count() > 10, "the loop went on");
+        assert!(largest <= STEP_N, "{largest} N in one tick");
+    }
+}
+
+/// From a device's service through `maille run --device inverse3` and back, with the device unplugged in mid-press.
+#[test]
+fn a_device_that_is_unplugged_in_mid_run_fades_and_comes_back() {
+    let service = Service::start();
+    let scratch = Scratch::new("haptic-inverse3");
+    // axes as the patient's and the origin at the first way point, which hovers before the surface: +y goes in
+    let device = format!("[device]\naddress = \"{}\"\nrotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\n", service.address);
+    let (run, domain, control) = started(&scratch, &pressing("path", &device), &["--device", "inverse3"]);
+    eventually("the pose arrives", || tool(&control).flags & TOOL_FADING == 0);
+    let start = tool(&control).tip_mm;
+    let go = |from: f64, to: f64| {
+        for n in 0..=200 {
+            service.put([0.0, from + (to - from) * f64::from(n) / 200.0, 0.0]);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    go(0.0, 9.0);
+    eventually("the tip has moved with the hand", || (tool(&control).tip_mm[1] - start[1] - 9.0).abs() < 0.1);
+    // out of the dent that it has made and in again, as a hand that keeps on pressing
+    let press = || {
+        for _ in 0..10 {
+            go(9.0, 4.0);
+            for n in 0..=200 {
+                service.put([0.0, 4.0 + 5.0 * f64::from(n) / 200.0, 0.0]);
+                std::thread::sleep(Duration::from_millis(2));
+                if norm(service.force_n()) > 0.1 {
+                    return true;
+                }
+            }
+        }
+        false
+    };
+    assert!(press(), "the force arrives at the device: {:?}\n{}", tool(&control), run.printed());
+    let force = service.force_n();
+    assert!(force[1] < 0.0, "it pushes the hand out: {force:?}");
+
+    service.plug(false);
+    eventually("the force has faded", || norm(tool(&control).force_n) == 0.0);
+    let before = tool(&control).stamp.sequence;
+    eventually("the run goes on without the device", || tool(&control).stamp.sequence > before + 200);
+    assert_eq!(tool(&control).force_n, [0.0; 3], "and without a force");
+    assert_eq!(control.service(Role::Haptic).restarts.load(Relaxed), 0);
+
+    service.plug(true);
+    assert!(press(), "it comes back: {:?}\n{}", tool(&control), run.printed());
+    drop(control);
+    ended(run, &domain);
+    eventually("what is let go gets no force", || service.force_n() == [0.0; 3]);
+}
