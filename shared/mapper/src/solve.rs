@@ -22,22 +22,13 @@ use wide::f32x4;
 /// Stored values of a brick's voxels; only those in the wanted spans mean something.
 pub type Values = [i16; EDGE * EDGE * EDGE];
 
-/// Two planes of rows by turns, so that they stay in the nearest cache.
-type Found = [[f32x4; EDGE]; 2 * EDGE];
-
-/// Where a row of a brick is kept.
-#[inline(always)]
-const fn kept(row: usize) -> usize {
-    row % (2 * EDGE)
-}
-
 /// Working memory of one thread.
 pub struct Workspace {
     pub window: Window,
     /// rows to be solved
     open: Box<Spans>,
-    /// x − X of the rows solved [voxels] in this plane of rows and the one before: [`kept`]
-    found: Box<Found>,
+    /// x − X of the rows solved [voxels]
+    found: Box<[[f32x4; EDGE]; ROWS]>,
     /// tissue and cuts around, where there are any
     pieces: Pieces,
     /// voxels left to the search of cells
@@ -49,7 +40,7 @@ impl Workspace {
         Self {
             window: Window::new(),
             open: Box::new([[0; 2]; ROWS]),
-            found: Box::new([[f32x4::ZERO; EDGE]; 2 * EDGE]),
+            found: Box::new([[f32x4::ZERO; EDGE]; ROWS]),
             pieces: Pieces::default(),
             left: OpenVoxels::new(),
         }
@@ -143,7 +134,7 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
             guess(open, found, own, row, range.clone(), &target, &mut position);
             report.iterations += u64::from(self.inverter.invert_row(window, &target, range.clone(), &mut position, &mut converged));
             for i in range.clone() {
-                found[kept(row)][i] = target[i] - position[i];
+                found[row][i] = target[i] - position[i];
             }
             // 3. values. X = x is the exact pre-image of what did not move; the kernel stops within its tolerance of it
             let still = |i: usize| f32x4::new(own[i - range.start]).simd_eq(f32x4::ZERO).to_bitmask() == 0b1111;
@@ -267,7 +258,7 @@ fn moved_span(displacement: &DisplacementBrick, row: usize, [from, to]: [u8; 2])
 #[inline(always)]
 fn guess(
     spans: &Spans,
-    found: &Found,
+    found: &[[f32x4; EDGE]; ROWS],
     own: &[[f32; 4]],
     row: usize,
     range: std::ops::Range<usize>,
@@ -291,7 +282,7 @@ fn guess(
     if common.is_empty() {
         return;
     }
-    let (below, before, corner) = (&found[kept(row - 1)], &found[kept(row - EDGE)], &found[kept(row - EDGE - 1)]);
+    let (below, before, corner) = (&found[row - 1], &found[row - EDGE], &found[row - EDGE - 1]);
     for i in common {
         position[i] = target[i] - (below[i] + before[i] - corner[i]);
     }
