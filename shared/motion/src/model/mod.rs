@@ -10,6 +10,7 @@ mod fit;
 mod kind;
 mod packed;
 mod rotation;
+mod whole;
 
 pub use at::{MotionAt, PointInverse};
 pub use collapse::{CollapseReport, Collapsed};
@@ -17,6 +18,7 @@ pub use fit::{PcaReport, combine, filter, fit_full_cycle, fit_half_cycle, fit_su
 pub use kind::{Kind, MAX_TERMS, Weights};
 pub use packed::{PackedField, Precision};
 pub use rotation::rotation_of;
+pub use whole::{FieldInverse, invert_field};
 
 use maille_volume::Grid;
 use nalgebra::Matrix3;

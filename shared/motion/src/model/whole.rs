@@ -1,0 +1,406 @@
+//! The inverse of one field at all of its nodes, each answer checked against the field as it was given.
+//!
+//! Sought is v with x + v(x) = X, X + u(X) = x, at every node x, u trilinear between nodes. Rows are inverted by `maille-displacement`'s Newton in index
+//! units, a row from the answers of the row before it, slices in parallel; what a row does not settle goes on damped. An answer is claimed
+//! only if |v + u(x + v)|, taken in f64 from the vectors in mm, is at most the tolerance, X lies on the grid (to the tolerance), and det(1 + ∂u/∂X) > 0 there.
+//!
+//! Search, for nodes without an answer: a cell's image lies in the box of its eight displaced corners, since trilinear interpolation is convex. So a node
+//! in no cell's box has no inverse on the grid, and that is proved; of the cells whose box holds it, the one whose affine part brings
+//! it nearest to its centre is tried. Bounded: one cell a node; boxes of more than [`WIDE`] nodes are only remembered as one box.
+//!
+//! Cost: about three evaluations a node. Memory: 16 bytes a node, and 8 more when nodes are searched. Deterministic.
+
+use super::super::MotionError;
+use super::at::Shape;
+use maille_displacement::{DisplacementField, FieldSample, Inverter, RowField, Scheme};
+use maille_volume::{ScalarField, VectorField};
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use wide::f32x4;
+
+/// An inverse field and what it is worth.
+#[derive(Clone, Debug)]
+pub struct FieldInverse {
+    /// v [mm, LPS] on the grid of u; NaN where there is none
+    pub field: VectorField,
+    /// |v + u(x + v)| [mm]; −1 where there is none
+    pub residual_mm: ScalarField,
+    /// nodes whose rest position lies beyond the grid
+    pub outside: usize,
+    /// nodes at which none was found, though one may lie inside
+    pub failures: usize,
+    /// nodes that only the search of cells settled
+    pub searched: usize,
+}
+
+/// Nodes inverted at once.
+const ROW: usize = 32;
+/// Nodes in the box of a cell beyond which the cell is not searched.
+const WIDE: usize = 512;
+
+/// What is known of a node.
+#[derive(Clone, Copy, PartialEq)]
+enum State {
+    Settled,
+    Beyond,
+    Open,
+}
+
+/// Inverts a field at its nodes; residuals are at most `tolerance_mm` wherever an answer is given.
+///
+/// # Errors
+/// When the grid has fewer than two nodes along an axis, or a vector is not finite.
+pub fn invert_field(field: &VectorField, tolerance_mm: f64) -> Result<FieldInverse, MotionError> {
+    let grid = &field.grid;
+    let count = grid.voxel_count();
+    if grid.size.iter().any(|&s| s < 2) || field.vectors.len() != count {
+        return Err(MotionError::Fields { needed: 1, given: 0 });
+    }
+    let whole = Whole::new(field, tolerance_mm)?;
+    let slice = grid.size[0] * grid.size[1];
+    let mut vectors = vec![[f32::NAN; 3]; count];
+    let mut residuals = vec![-1.0f32; count];
+    let mut states = vec![State::Open; count];
+    vectors
+        .par_chunks_mut(slice)
+        .zip(residuals.par_chunks_mut(slice))
+        .zip(states.par_chunks_mut(slice))
+        .enumerate()
+        .for_each(|(k, ((vectors, residuals), states))| whole.invert_slice(k, vectors, residuals, states));
+    let searched = if states.iter().all(|s| *s == State::Settled) { 0 } else { whole.search(&mut vectors, &mut residuals, &mut states) };
+    let of = |state: State| states.iter().filter(|s| **s == state).count();
+    let (outside, failures) = (of(State::Beyond), of(State::Open));
+    Ok(FieldInverse {
+        field: VectorField { grid: grid.clone(), vectors },
+        residual_mm: ScalarField { grid: grid.clone(), values: residuals },
+        outside,
+        failures,
+        searched,
+    })
+}
+
+/// A field in index units, and how it is inverted.
+struct Whole<'a> {
+    given: &'a VectorField,
+    shape: Shape,
+    nodes: Vec<[f32; 4]>,
+    index_from_mm: Matrix3<f64>,
+    mm_from_index: Matrix3<f64>,
+    inverter: Inverter,
+    tolerance_mm: f64,
+    /// how far beyond the last node an answer still lies on the grid [voxels]
+    slack: [f64; 3],
+}
+
+impl<'a> Whole<'a> {
+    fn new(given: &'a VectorField, tolerance_mm: f64) -> Result<Self, MotionError> {
+        let grid = &given.grid;
+        let index_from_mm = grid.index_from_world_matrix();
+        let in_index = |v: &[f32; 3]| {
+            let u = index_from_mm * Vector3::from(v.map(f64::from));
+            [u.x as f32, u.y as f32, u.z as f32, 0.0]
+        };
+        let nodes: Vec<[f32; 4]> = given.vectors.par_iter().map(in_index).collect();
+        if let Some(node) = nodes.par_iter().position_first(|v| !v.iter().all(|c| c.is_finite())) {
+            return Err(MotionError::Vector { field: 0, node });
+        }
+        // the max norm of three components bounds the length to √3; below a few units of rounding of an index f32 cannot go,
+        // the rest is done in f64
+        let reach = 4.0 * f32::EPSILON * grid.size.into_iter().max().unwrap_or(1) as f32;
+        let tolerance = ((0.5 * tolerance_mm / grid.min_spacing()) as f32).max(reach);
+        let inverter = Inverter { scheme: Scheme::Newton, tolerance, contraction: 0.0, weight: [1.0; 3], max_iterations: 60 };
+        Ok(Self {
+            given,
+            shape: Shape::new(grid),
+            nodes,
+            index_from_mm,
+            mm_from_index: grid.world_from_index_matrix(),
+            inverter: inverter.on_spacing(grid.spacing.map(|s| s as f32)),
+            tolerance_mm,
+            slack: grid.spacing.map(|s| tolerance_mm / s),
+        })
+    }
+
+    fn node(&self, at: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.given.grid.size;
+        [at % nx, at / nx % ny, at / (nx * ny)]
+    }
+
+    fn invert_slice(&self, k: usize, vectors: &mut [[f32; 3]], residuals: &mut [f32], states: &mut [State]) {
+        let [nx, ny, _] = self.given.grid.size;
+        // v of the row before, and where it leads: by its change from the row before that
+        let (mut before, mut lead) = (vec![f32x4::ZERO; nx], vec![f32x4::ZERO; nx]);
+        for (j, block) in (0..ny).flat_map(|j| (0..nx.div_ceil(ROW)).map(move |block| (j, block))) {
+            let first = block * ROW;
+            let range = 0..ROW.min(nx - first);
+            let target: [f32x4; ROW] = std::array::from_fn(|n| f32x4::new([(first + n) as f32, j as f32, k as f32, 0.0]));
+            let (mut position, mut converged) = (target, [false; ROW]);
+            range.clone().for_each(|n| position[n] += lead[first + n]);
+            self.inverter.invert_row(self, &target, range.clone(), &mut position, &mut converged);
+            for n in range {
+                let (at, node) = (j * nx + first + n, [first + n, j, k]);
+                let starts = [target[n] + lead[first + n], target[n]];
+                let mut found = converged[n].then(|| lanes(position[n]));
+                for start in starts {
+                    found = found.or_else(|| self.damped(node, lanes(start)));
+                }
+                let Some(found) = found else { continue };
+                let v = f32x4::new([found[0], found[1], found[2], 0.0]) - target[n];
+                lead[first + n] = if j == 0 { v } else { v + v - before[first + n] };
+                before[first + n] = v;
+                match self.claim(node, found) {
+                    Some((v, r)) => (vectors[at], residuals[at], states[at]) = (v, r, State::Settled),
+                    None if !self.holds(found.map(f64::from)) => states[at] = State::Beyond,
+                    None => {}
+                }
+            }
+        }
+    }
+
+    fn damped(&self, node: [usize; 3], start: [f32; 3]) -> Option<[f32; 3]> {
+        let found = self.inverter.invert(self, node.map(|i| i as f32), start);
+        found.converged.then_some(found.position)
+    }
+
+    fn holds(&self, index: [f64; 3]) -> bool {
+        (0..3).all(|c| index[c] >= -self.slack[c] && index[c] <= (self.given.grid.size[c] - 1) as f64 + self.slack[c])
+    }
+
+    /// v and its residual as they will be written, if they hold what they promise.
+    fn claim(&self, node: [usize; 3], found: [f32; 3]) -> Option<([f32; 3], f32)> {
+        let node = Vector3::from(node.map(|i| i as f64));
+        let mut v = self.mm_from_index * (Vector3::from(found.map(f64::from)) - node);
+        for _ in 0..3 {
+            let written = v.map(|c| c as f32);
+            let index = node + self.index_from_mm * written.map(f64::from);
+            let residual = written.map(f64::from) + self.given_mm(index);
+            let gradient = Matrix3::identity() + self.jacobian(index);
+            if residual.norm() <= self.tolerance_mm {
+                let fits = self.holds(index.into()) && gradient.determinant() > 0.0;
+                return fits.then(|| (written.into(), residual.norm() as f32));
+            }
+            // f32 brought it near, the last step is taken in f64
+            v -= self.mm_from_index * gradient.try_inverse()? * self.index_from_mm * residual;
+        }
+        None
+    }
+
+    /// u [mm] at a continuous index, from the vectors as they were given and without rounding to f32 on the way.
+    fn given_mm(&self, index: Vector3<f64>) -> Vector3<f64> {
+        let grid = &self.given.grid;
+        let held: [f64; 3] = std::array::from_fn(|c| index[c].clamp(0.0, (grid.size[c] - 1) as f64));
+        let low: [usize; 3] = std::array::from_fn(|c| (held[c] as usize).min(grid.size[c] - 2));
+        let [x, y, z]: [f64; 3] = std::array::from_fn(|c| held[c] - low[c] as f64);
+        let first = grid.offset(low[0], low[1], low[2]);
+        let (row, slice) = (grid.size[0], grid.size[0] * grid.size[1]);
+        let node = |at: usize| Vector3::from(self.given.vectors[at].map(f64::from));
+        let line = |at: usize| node(at) * (1.0 - x) + node(at + 1) * x;
+        let plane = |at: usize| line(at) * (1.0 - y) + line(at + row) * y;
+        plane(first) * (1.0 - z) + plane(first + slice) * z
+    }
+
+    fn jacobian(&self, index: Vector3<f64>) -> Matrix3<f64> {
+        // a hair beyond the last node u is constant, and would hide a fold that ends there
+        let last = self.given.grid.size.map(|s| (s - 1) as f64);
+        let slopes = self.at(std::array::from_fn(|c| index[c].clamp(0.0, last[c]) as f32)).jacobian;
+        Matrix3::from_fn(|r, c| f64::from(slopes[r][c]))
+    }
+
+    /// Looks for nodes without an answer in the cells whose image may hold them. Returns how many were found.
+    fn search(&self, vectors: &mut [[f32; 3]], residuals: &mut [f32], states: &mut [State]) -> usize {
+        let [nx, ny, nz] = self.given.grid.size;
+        // the best cell: how far from its centre (bits of a positive f32 sort as numbers), then its offset
+        let best: Vec<AtomicU64> = (0..states.len()).map(|_| AtomicU64::new(u64::MAX)).collect();
+        let known: &[State] = states;
+        let nothing = ([usize::MAX; 3], [0usize; 3]);
+        let wide = (0..nz - 1)
+            .into_par_iter()
+            .map(|k| {
+                let mut wide = nothing;
+                for (i, j) in (0..ny - 1).flat_map(|j| (0..nx - 1).map(move |i| (i, j))) {
+                    let Some((low, high)) = self.box_of([i, j, k]) else { continue };
+                    if (0..3).map(|c| high[c] - low[c] + 1).product::<usize>() > WIDE {
+                        wide = (0..3).fold(wide, |(mut a, mut b), c| {
+                            (a[c], b[c]) = (a[c].min(low[c]), b[c].max(high[c]));
+                            (a, b)
+                        });
+                    } else {
+                        self.offer([i, j, k], low, high, known, &best);
+                    }
+                }
+                wide
+            })
+            .reduce(|| nothing, |a, b| (std::array::from_fn(|c| a.0[c].min(b.0[c])), std::array::from_fn(|c| a.1[c].max(b.1[c]))));
+        let settle = |(at, ((v, r), state)): (usize, ((&mut [f32; 3], &mut f32), &mut State))| -> usize {
+            if *state == State::Settled {
+                return 0;
+            }
+            let node = self.node(at);
+            let key = best[at].load(Relaxed);
+            if key == u64::MAX {
+                if *state == State::Open && !(0..3).all(|c| wide.0[c] <= node[c] && node[c] <= wide.1[c]) {
+                    *state = State::Beyond;
+                }
+                return 0;
+            }
+            let cell = self.node((key & u64::from(u32::MAX)) as usize);
+            let center = cell.map(|c| c as f32 + 0.5);
+            let step = self.affine_step(cell, node).map_or([0.0; 3], |s| s.map(|c| c.clamp(-0.499, 0.499) as f32).into());
+            let starts = [std::array::from_fn(|c| center[c] + step[c]), center];
+            let found = starts.into_iter().find_map(|start| self.damped(node, start).and_then(|x| self.claim(node, x)));
+            if let Some(found) = found {
+                ((*v, *r), *state) = (found, State::Settled);
+            }
+            usize::from(*state == State::Settled)
+        };
+        vectors.par_iter_mut().zip(residuals).zip(states).enumerate().map(settle).sum()
+    }
+
+    /// First and last node in the box of a cell's displaced corners.
+    fn box_of(&self, cell: [usize; 3]) -> Option<([usize; 3], [usize; 3])> {
+        let (mut low, mut high) = ([f32::MAX; 3], [f32::MIN; 3]);
+        for corner in 0..8usize {
+            let at: [usize; 3] = std::array::from_fn(|c| cell[c] + (corner >> c & 1));
+            let u = self.nodes[self.given.grid.offset(at[0], at[1], at[2])];
+            for c in 0..3 {
+                let x = at[c] as f32 + u[c];
+                (low[c], high[c]) = (low[c].min(x), high[c].max(x));
+            }
+        }
+        // a hair wider, so that rounding loses no node
+        let last = self.given.grid.size.map(|s| (s - 1) as f32);
+        let low: [f32; 3] = std::array::from_fn(|c| (low[c] - 1e-3).ceil().max(0.0));
+        let high: [f32; 3] = std::array::from_fn(|c| (high[c] + 1e-3).floor().min(last[c]));
+        (0..3).all(|c| low[c] <= high[c]).then(|| (low.map(|v| v as usize), high.map(|v| v as usize)))
+    }
+
+    /// Offers a cell to the nodes of its box that have no answer.
+    fn offer(&self, cell: [usize; 3], low: [usize; 3], high: [usize; 3], states: &[State], best: &[AtomicU64]) {
+        let grid = &self.given.grid;
+        for k in low[2]..=high[2] {
+            for j in low[1]..=high[1] {
+                for i in low[0]..=high[0] {
+                    let at = grid.offset(i, j, k);
+                    if states[at] != State::Settled {
+                        // where the cell is folded its affine part says nothing, but it may hold the node in a part that is not
+                        let far = self.affine_step(cell, [i, j, k]).map_or(1e6, |s| s.amax().min(1e6)) as f32;
+                        let key = u64::from(far.to_bits()) << 32 | grid.offset(cell[0], cell[1], cell[2]) as u64;
+                        best[at].fetch_min(key, Relaxed);
+                    }
+                }
+            }
+        }
+    }
+
+    /// From a cell's centre to where its affine part has the rest position of a node.
+    fn affine_step(&self, cell: [usize; 3], node: [usize; 3]) -> Option<Vector3<f64>> {
+        let center = cell.map(|c| c as f32 + 0.5);
+        let here = self.at(center);
+        let gradient = Matrix3::identity() + Matrix3::from_fn(|r, c| f64::from(here.jacobian[r][c]));
+        let missing = Vector3::from_fn(|c, _| node[c] as f64 - f64::from(center[c]) - f64::from(here.u[c]));
+        (gradient.determinant() > 0.0).then(|| gradient.try_inverse()).flatten().map(|inverse| inverse * missing)
+    }
+}
+
+#[inline]
+fn lanes(v: f32x4) -> [f32; 3] {
+    let [x, y, z, _] = v.to_array();
+    [x, y, z]
+}
+
+impl RowField for Whole<'_> {
+    #[inline]
+    fn value(&self, index: f32x4) -> f32x4 {
+        self.shape.blend(&self.shape.cell(index), |at| f32x4::new(self.nodes[at]))
+    }
+    #[inline]
+    fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]) {
+        let cell = self.shape.cell(index);
+        let (u, slopes) = self.shape.blend_jet(&cell, |at| f32x4::new(self.nodes[at]));
+        // beyond the border u is constant along that axis
+        (u, std::array::from_fn(|d| if cell.held[d] { f32x4::ZERO } else { slopes[d] }))
+    }
+}
+
+impl DisplacementField for Whole<'_> {
+    #[inline]
+    fn at(&self, index: [f32; 3]) -> FieldSample {
+        let (u, slopes) = self.jet(f32x4::new([index[0], index[1], index[2], 0.0]));
+        let s = slopes.map(f32x4::to_array);
+        FieldSample { u: lanes(u), jacobian: std::array::from_fn(|c| std::array::from_fn(|d| s[d][c])) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::resample::sample;
+    use maille_volume::Grid;
+
+    /// A grid that is turned, sheared by nothing, and of three spacings.
+    fn grid() -> Grid {
+        let mut grid = Grid::axis_aligned([37, 34, 21], [1.0, 1.5, 2.0]);
+        let (s, c) = 0.4f64.sin_cos();
+        grid.direction = [c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0];
+        grid.origin = [-20.0, 11.0, 300.0];
+        grid
+    }
+
+    fn field(u: impl Fn([f64; 3]) -> [f64; 3]) -> VectorField {
+        let mut field = VectorField::zeros(grid());
+        for n in 0..field.vectors.len() {
+            let at = [n % 37, n / 37 % 34, n / (37 * 34)].map(|i| i as f64);
+            field.vectors[n] = u(at).map(|c| c as f32);
+        }
+        field
+    }
+
+    #[test]
+    fn what_is_claimed_holds_and_what_is_not_lies_beyond() {
+        // smooth, up to 4 mm, zero on no border
+        let u = field(|[i, j, k]| [3.0 * (i * 0.2 + k * 0.1).sin(), 2.0 * (j * 0.15).cos(), 2.5 * (i * 0.1 - j * 0.12).sin()]);
+        let found = invert_field(&u, 1e-4).unwrap();
+        assert!(found.failures == 0 && found.outside > 0, "{} {}", found.failures, found.outside);
+        let mut claimed = 0;
+        for (n, v) in found.field.vectors.iter().enumerate() {
+            let r = found.residual_mm.values[n];
+            assert_eq!(r < 0.0, v[0].is_nan());
+            if r >= 0.0 {
+                let x = u.grid.world_from_index([n % 37, n / 37 % 34, n / (37 * 34)].map(|i| i as f64));
+                let back = sample(&u, u.grid.index_from_world(std::array::from_fn(|c| x[c] + f64::from(v[c]))));
+                let miss = (0..3).map(|c| f64::from(v[c] + back[c]).powi(2)).sum::<f64>().sqrt();
+                assert!(miss <= 1.1e-4 && r <= 1e-4, "{miss} {r}");
+                claimed += 1;
+            }
+        }
+        assert!(claimed > 20_000 && claimed + found.outside == u.vectors.len());
+    }
+
+    #[test]
+    fn rest_is_its_own_inverse_to_the_last_node_and_a_shift_loses_what_it_uncovers() {
+        let still = invert_field(&field(|_| [0.0; 3]), 1e-3).unwrap();
+        assert!((still.outside, still.failures) == (0, 0) && still.field.vectors.iter().all(|v| *v == [0.0; 3]));
+        let shift = invert_field(&field(|_| [0.0, 0.0, 4.0]), 1e-3).unwrap();
+        // two slices of 2 mm are uncovered
+        assert_eq!((shift.outside, shift.failures), (2 * 37 * 34, 0));
+        assert!(shift.field.vectors[2 * 37 * 34..].iter().all(|v| (v[2] + 4.0).abs() < 1e-5));
+    }
+
+    #[test]
+    fn sliding_is_settled_and_folds_are_told() {
+        // halves slide by 6 mm along each other within one cell: the gradient is 6, the inverse exists all the same
+        let sliding = field(|[_, j, _]| [0.0, 0.0, if j < 17.0 { 3.0 } else { -3.0 }]);
+        let found = invert_field(&sliding, 1e-3).unwrap();
+        assert_eq!(found.failures, 0);
+        assert!(found.outside < 4 * 37 * 34, "{}", found.outside);
+        // X ↦ −X/2 + …: turned inside out everywhere
+        let (c, s) = (0.4f64.cos(), 0.4f64.sin());
+        let folded = field(|[i, _, _]| [-1.5 * (i - 18.0) * c, -1.5 * (i - 18.0) * s, 0.0]);
+        let found = invert_field(&folded, 1e-3).unwrap();
+        assert!(found.failures > 0 && found.failures + found.outside == found.field.vectors.len(), "{} {}", found.failures, found.outside);
+        let mut broken = folded;
+        broken.vectors[77][1] = f32::NAN;
+        assert_eq!(invert_field(&broken, 1e-3).unwrap_err(), MotionError::Vector { field: 0, node: 77 });
+    }
+}
