@@ -5,9 +5,11 @@
 //! displacement *along the grid's axes* (rotate the written vectors back by the direction cosines to check them).
 
 use super::{Failure, Outcome};
-use maille_chainmail::{Admission, ChainMail, ChangedRegion, Motion, Pin, PushOutcome, Tissue, enclosing_elements};
+use maille_chainmail::{
+    Admission, ChainMail, ChangedRegion, LinkModel, Metric, Motion, Pin, PushOutcome, Tissue, Triangle, enclosing_elements,
+};
 use maille_displacement::{along_axes, in_patient};
-use maille_mapper::{MapOptions, MapReport, remap, rest_position};
+use maille_mapper::{MapOptions, MapReport, Sampling, remap, rest_position, tissue_rest_position};
 use maille_volume::{
     BrickSource, BrickedVolume, Grid, Image, Pixels, Rescale, VectorField, Volume,
     io::{ReadOptions, read, write_image, write_vector_field},
@@ -21,8 +23,14 @@ pub struct Args {
     /// volume to deform: NRRD, MHA, NIfTI or a DICOM directory
     volume: PathBuf,
     /// push the eight elements around a point by a vector, LPS mm: X,Y,Z:DX,DY,DZ; repeat it for several pushes, in order
-    #[arg(long = "push", value_name = "X,Y,Z:DX,DY,DZ", required = true, allow_hyphen_values = true)]
+    #[arg(long = "push", value_name = "X,Y,Z:DX,DY,DZ", required_unless_present_any = ["cuts", "removed"], allow_hyphen_values = true)]
     pushes: Vec<Push>,
+    /// cut the links that a triangle crosses, LPS mm: three corners X,Y,Z:X,Y,Z:X,Y,Z; repeat it for more; all cuts come before the pushes
+    #[arg(long = "cut", value_name = "X,Y,Z:X,Y,Z:X,Y,Z", allow_hyphen_values = true)]
+    cuts: Vec<Corners>,
+    /// take a sphere of tissue out, LPS mm: X,Y,Z:R; before the pushes
+    #[arg(long = "remove", value_name = "X,Y,Z:R", allow_hyphen_values = true)]
+    removed: Vec<Sphere>,
     /// where to write the deformed volume (.nrrd, .mha, .nii, .nii.gz)
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
@@ -53,6 +61,12 @@ pub struct Args {
     /// what to do with a push that bone refuses in part: shorten it, or cut each component where it meets its limit
     #[arg(long, value_enum, default_value_t = Refusal::Shorten)]
     refusal: Refusal,
+    /// shape of the regions in which neighbours may move: square dents and fast, or rounder and slower
+    #[arg(long, value_enum, default_value_t = MetricArg::Cubic)]
+    metric: MetricArg,
+    /// interpolation of the values that are moved
+    #[arg(long, value_enum, default_value_t = SamplingArg::Linear)]
+    sampling: SamplingArg,
     /// print one JSON object: what each push moved, what was refused, what mapping did
     #[arg(long)]
     json: bool,
@@ -64,6 +78,52 @@ enum Refusal {
     Shorten,
     /// each component as far as it can go
     Components,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum MetricArg {
+    /// six neighbours
+    Cubic,
+    /// diagonal neighbours too
+    Round,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum SamplingArg {
+    /// trilinear
+    Linear,
+    /// tricubic (Catmull-Rom)
+    Cubic,
+}
+
+/// Three corners of a triangle, LPS mm.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Corners([[f64; 3]; 3]);
+
+impl FromStr for Corners {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let corners: Vec<[f64; 3]> = text.split(':').map(triple).collect::<Result<_, _>>()?;
+        corners.try_into().map(Self).map_err(|c: Vec<_>| format!("`{text}` has {} corners, a triangle has three", c.len()))
+    }
+}
+
+/// Centre and radius, LPS mm.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Sphere([f64; 3], f64);
+
+impl FromStr for Sphere {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (center, radius) = text.split_once(':').ok_or("expected X,Y,Z:R: a centre, a colon, a radius")?;
+        let number: f64 = radius.trim().parse().map_err(|_| format!("`{radius}` is not a number"))?;
+        if !(number > 0.0 && number.is_finite()) {
+            return Err(format!("`{radius}` is not a radius"));
+        }
+        Ok(Self(triple(center)?, number))
+    }
 }
 
 /// A point and a vector, LPS mm.
@@ -113,7 +173,18 @@ pub fn run(args: &Args) -> Outcome {
     let rest = BrickedVolume::from_volume(&volume);
     let grid = &volume.info.grid;
     let mut mail = ChainMail::new(rest.info(), tissue);
+    let metric = if args.metric == MetricArg::Round { Metric::Round } else { Metric::Cubic };
+    mail.set_link_model(LinkModel { metric, ..LinkModel::default() });
     let mut region = ChangedRegion::default();
+    let triangles: Vec<Triangle> = args.cuts.iter().map(|c| c.0).collect();
+    region.merge(&mail.cut_triangles(&rest, &triangles));
+    for &Sphere(center, radius) in &args.removed {
+        region.merge(&mail.remove_sphere(&rest, center, radius));
+    }
+    let cut_links: u64 = mail.cut_bricks().iter().filter_map(|&id| mail.cut_brick(id)).flatten().map(|c| u64::from(c.count_ones())).sum();
+    if cut_links > 0 && !args.json {
+        println!("{cut_links} links cut");
+    }
     let mut pushes = Vec::new();
     for push in &args.pushes {
         let outcome = apply(&mut mail, &rest, grid, push);
@@ -124,7 +195,8 @@ pub fn run(args: &Args) -> Outcome {
         }
     }
     let mut deformed = rest.clone();
-    let report = remap(&rest, &mail, &region, &mut deformed, &MapOptions::default());
+    let sampling = if args.sampling == SamplingArg::Cubic { Sampling::Cubic } else { Sampling::Linear };
+    let report = remap(&rest, &mail, &region, &mut deformed, &MapOptions { sampling, ..MapOptions::default() });
 
     let written = |e: maille_volume::io::WriteError| Failure::Refused(e.to_string());
     write_image(&args.output, &like_the_file(&reading.image, &volume, &deformed.to_volume())).map_err(written)?;
@@ -138,7 +210,7 @@ pub fn run(args: &Args) -> Outcome {
         write_image(path, &links(grid, &rest, &mail)).map_err(written)?;
     }
     if args.json {
-        println!("{}", summary(grid, args, pushes, &mail, &report));
+        println!("{}", summary(grid, args, pushes, cut_links, &mail, &report));
     } else {
         println!("{} voxels rewritten in {} bricks", report.voxels, report.bricks.len());
     }
@@ -159,7 +231,9 @@ fn tissue(args: &Args) -> Result<Tissue, Failure> {
 
 /// Pushes the eight elements that are around the point now; on tissue already deformed these are the ones that came there.
 fn apply(mail: &mut ChainMail, rest: &BrickedVolume, grid: &Grid, push: &Push) -> PushOutcome {
-    let at = rest_position(mail, grid, push.point).unwrap_or(push.point);
+    let beside_gaps = mail.tissue().threshold_hu.is_some() || !mail.cut_bricks().is_empty();
+    let found = if beside_gaps { tissue_rest_position(rest, mail, push.point) } else { rest_position(mail, grid, push.point) };
+    let at = found.unwrap_or(push.point);
     let vector = along_axes(grid, push.vector).map(|v| v as f32);
     let pins: Vec<Pin> = enclosing_elements(grid, at).into_iter().map(|voxel| Pin { voxel, motion: Motion::By(vector) }).collect();
     mail.push(rest, &pins)
@@ -194,7 +268,7 @@ fn sentence(grid: &Grid, push: &Push, outcome: &PushOutcome) -> String {
     format!("push at {x},{y},{z}: {} elements moved{part}", outcome.moved)
 }
 
-fn summary(grid: &Grid, args: &Args, pushes: Vec<Value>, mail: &ChainMail, report: &MapReport) -> Value {
+fn summary(grid: &Grid, args: &Args, pushes: Vec<Value>, cut_links: u64, mail: &ChainMail, report: &MapReport) -> Value {
     let (mut displaced, mut largest) = (0u64, 0.0f64);
     each_displaced(grid, mail, |_, u| {
         displaced += 1;
@@ -208,6 +282,7 @@ fn summary(grid: &Grid, args: &Args, pushes: Vec<Value>, mail: &ChainMail, repor
         "bone_hu": args.bone,
         "density_scaling": args.density_scaling,
         "movement_limit_mm": args.movement_limit,
+        "links_cut": cut_links,
         "pushes": pushes,
         "elements_displaced": displaced,
         "largest_displacement_mm": largest,
@@ -217,6 +292,7 @@ fn summary(grid: &Grid, args: &Args, pushes: Vec<Value>, mail: &ChainMail, repor
             "iterations": report.iterations,
             "searched": report.searched,
             "voids": report.voids,
+            "folded": report.folded,
             "failures": report.failures,
         },
     })

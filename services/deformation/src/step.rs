@@ -16,7 +16,7 @@ use maille_chainmail::{
 };
 use maille_contract::{Stamp, ToolMove, ToolState};
 use maille_displacement::{along_axes, in_patient};
-use maille_mapper::{BrickSink, MapOptions, Mapper, rest_position};
+use maille_mapper::{BrickSink, MapOptions, Mapper, Sampling, rest_position, tissue_rest_position};
 use maille_scene::{Pins, Push, Relaxation, Scene, ToolKind};
 use maille_store::{CommitOutcome, Cuts, Plastic, Reader, Transaction, Writer};
 use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
@@ -101,7 +101,8 @@ impl Engine {
             },
         };
         let tolerance = (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32;
-        let map = MapOptions { tolerance, void_hu: VOID_HU, ..MapOptions::default() };
+        let sampling = if d.sampling_order >= 3 { Sampling::Cubic } else { Sampling::Linear };
+        let map = MapOptions { tolerance, void_hu: VOID_HU, sampling, ..MapOptions::default() };
         let state = State { version: VERSION, threshold_hu: d.threshold_hu, pushes: 0, last_move: Stamp::default(), last_step_ns: 0 };
         let relax = scene.has_effect("relaxation").then(|| match d.relaxation {
             Relaxation::Decay => Relax::Decay(d.relaxation_s),
@@ -209,7 +210,14 @@ impl Engine {
     pub fn step(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         let (from, push) = self.surface_push(message, reader)?;
         let grid = &reader.info().grid;
-        let rest_mm = rest_position(&self.mail, grid, from)?;
+        let beside_gaps = self.object_shape || self.blade_mm.is_some();
+        let rest_mm = if beside_gaps {
+            // the push begins on a surface; a hair inside it there is tissue
+            let inward = |s: f64| std::array::from_fn(|c| from[c] + push[c] * s);
+            [0.0, 0.25, 0.5].into_iter().find_map(|s| tissue_rest_position(&reader.rest(), &self.mail, inward(s)))?
+        } else {
+            rest_position(&self.mail, grid, from)?
+        };
         let elements = match self.pins {
             Pins::Enclosing => enclosing_elements(grid, rest_mm),
             Pins::Sphere => elements_in_sphere(grid, rest_mm, message.radius_mm),

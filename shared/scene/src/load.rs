@@ -289,6 +289,10 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some("set `cutting = true` under [effects], or hold another tool".into());
         faults.push(document.fault("tool.kind", "a blade is good for nothing without the effect `cutting`", "needs an effect", help));
     }
+    if scene.deformation.sampling_order == 2 {
+        let help = Some("use 1 (trilinear) or 3 (tricubic)".into());
+        faults.push(document.fault("deformation.sampling_order", "there is no interpolation of order 2", "1 or 3", help));
+    }
     if scene.volume.file.is_some() && scene.volume.phantom.is_some() {
         let help = Some("keep `file` for a patient of your own, or `phantom` for a made one".into());
         faults.push(document.fault("volume.phantom", "[volume] names both a file and a phantom", "one of them too many", help));

@@ -337,6 +337,17 @@ pub static KNOBS: &[Knob] = &[
         get: |s| s.deformation.inversion_tolerance_mm,
         set: |s, v| s.deformation.inversion_tolerance_mm = v,
     },
+    Knob {
+        name: "deformation.sampling_order",
+        effect: "deformation",
+        summary: "order of the interpolation of values that are moved: 1 trilinear, 3 tricubic",
+        defaults: [1.0, 1.0, 3.0],
+        error: "difference of the rewritten voxels [HU RMS]",
+        truth: "an analytic volume, resampled exactly",
+        cost: "step time, by a half",
+        get: |s| s.deformation.sampling_order.into(),
+        set: |s, v| s.deformation.sampling_order = v as u32,
+    },
 ];
 
 #[cfg(test)]

@@ -77,6 +77,8 @@ pub struct Deformation {
     pub push_scale: f64,
     /// residual |x − X − u(X)| at which the mapper's inversion stops [mm], 0.0001 to 1 (a knob)
     pub inversion_tolerance_mm: f64,
+    /// order of the interpolation of values that are moved: 1 trilinear, 3 tricubic (a knob)
+    pub sampling_order: u32,
     /// at most so many commits a second [Hz], 1 to 1000
     pub rate_hz: f64,
     /// threads of the process; by default a share of the machine's cores
@@ -99,6 +101,7 @@ impl Default for Deformation {
             pins: Pins::Enclosing,
             push_scale: 1.0,
             inversion_tolerance_mm: 0.01,
+            sampling_order: 1,
             rate_hz: 60.0,
             threads: None,
         }
