@@ -15,6 +15,7 @@ pub(crate) struct View {
     threshold_hu: f64,
     window_hu: [f64; 2],
     step: Step,
+    opacity_end: f64,
     shading: bool,
     page: Option<ViewState>,
     generation: u64,
@@ -33,6 +34,7 @@ impl View {
             threshold_hu: scene.deformation.threshold_hu,
             window_hu: r.section_window_hu,
             step: Step::Voxels(r.step),
+            opacity_end: r.opacity_end,
             shading: r.shading,
             page: None,
             generation: 0,
@@ -98,6 +100,7 @@ impl View {
             settings.transfer.opacity = points.iter().map(|p| [p[0], p[4]]).collect();
         }
         settings.step = self.step;
+        settings.opacity_end = self.opacity_end;
         if !self.shading {
             settings.shading = None;
         } else if at_tip {
