@@ -19,7 +19,7 @@ mod hand;
 
 use maille_contract::{Role, ServiceState, ToolState, control::Counter};
 use maille_store::{
-    FREE_PINS, Reader, Snapshot,
+    Cuts, FREE_PINS, Labels, Plastic, Reader, Snapshot,
     fault::{Action, Faults, Point},
 };
 use maille_transport::{ControlMap, Domain};
@@ -68,8 +68,14 @@ fn fingerprint(snapshot: &Snapshot<'_>) -> u64 {
         for four in snapshot.brick(id).voxels.chunks(4) {
             take(four.iter().fold(0, |word, &v| word << 16 | u64::from(v as u16)));
         }
-        for pair in snapshot.displacement(id).into_iter().flat_map(|d| d.chunks(2)) {
-            take(pair.iter().fold(0, |word, v| word << 32 | u64::from(v.to_bits())));
+        snapshot.brick(id).cells.iter().flatten().for_each(|&v| take(u64::from(v as u16)));
+        for numbers in [snapshot.displacement(id), snapshot.channel::<Plastic>(id)].into_iter().flatten() {
+            for pair in numbers.chunks(2) {
+                take(pair.iter().fold(0, |word, v| word << 32 | u64::from(v.to_bits())));
+            }
+        }
+        for bytes in [snapshot.channel::<Cuts>(id), snapshot.channel::<Labels>(id)].into_iter().flatten() {
+            bytes.iter().for_each(|&byte| take(byte.into()));
         }
     }
     snapshot.state().iter().for_each(|&byte| take(byte.into()));
@@ -172,8 +178,9 @@ fn tissue_stays_bit_for_bit_and_all_come_back_whatever_is_killed_or_stopped() {
     let scratch = Scratch::new("faults");
     let path = scratch.file("run.json");
     // tissue that comes back keeps the writer at work: transactions all the time
-    let relaxing =
-        SMALL_SCENE.replace("deformation = true", "deformation = true\nrelaxation = true") + "[deformation]\nrelaxation_s = 0.2\n";
+    let relaxing = SMALL_SCENE
+        .replace("deformation = true", "deformation = true\nrelaxation = true\nplasticity = true\nobject-shape = true")
+        + "[deformation]\nrelaxation = \"elastic\"\n[[tissue]]\nname = \"all\"\nhu = [-300.0, 32767.0]\nstiffness_n_per_mm = 0.3\nplastic = 0.2\n";
     let scene = scratch.write("small.toml", &relaxing);
     let command = &mut Command::new(env!("CARGO_BIN_EXE_maille"));
     let mut run = Run::start(command.arg("run").arg(scene).args(["--headless", "--report", path.to_str().expect("a path in UTF-8")]));

@@ -133,6 +133,7 @@ impl Memory {
     fn of(plan: &Plan, info: &VolumeInfo) -> Self {
         let sizes = StoreSizes::by_segment(|segment| plan.slots(segment));
         let mut segments: Vec<_> = plan.segments.iter().map(|s| (s.name, s.bytes, s.meaning)).collect();
+        segments.push(("frames", maille_transport::frame_pool_bytes(plan.frame_bytes), "pictures on their way to readers"));
         for (name, bytes) in (StorePlan { info: info.clone(), sizes }).segments() {
             // the store knows its own tables; of bricks both say the same
             match segments.iter_mut().find(|(planned, ..)| *planned == name) {

@@ -66,6 +66,17 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
     prefault_stack();
     tick.resume(life.control());
     life.ready();
+    // pages of the tissue come beside the loop: until then a first touch costs a tick a microsecond, waiting for all would cost the hand 0.1 s a GiB
+    std::thread::scope(|scope| {
+        scope.spawn(|| reader.prefault());
+        ticks(&scene, &mut life, &mut tick);
+    });
+    publisher.stop();
+    Ok(())
+}
+
+/// The loop itself, until the run ends and the force has faded.
+fn ticks(scene: &Scene, life: &mut Life, tick: &mut tick::Loop<'_>) {
     let mut period = Period::new(scene.haptic.rate_hz);
     let mut leaving_since = None;
     loop {
@@ -74,7 +85,7 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
         if !life.beat(began) && leaving_since.is_none() {
             leaving_since = Some(began);
         }
-        let (force_n, allocations) = steady(|| tick.run(&life, began, leaving_since.is_some()));
+        let (force_n, allocations) = steady(|| tick.run(life, began, leaving_since.is_some()));
         if life.record(began, monotonic_ns().saturating_sub(began), Some(released.lateness_ns)) {
             let cell = life.cell();
             cell.count(Counter::Allocations, allocations);
@@ -87,6 +98,4 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
             break;
         }
     }
-    publisher.stop();
-    Ok(())
 }

@@ -3,8 +3,8 @@
 use crate::{HapticError, device, operator::Operator, outbox::Outbox, setup};
 use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
-use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER};
-use maille_contract::{ControlBlock, Role, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
+use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
+use maille_contract::{ControlBlock, Role, ServiceCell, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Scene};
 use maille_store::Reader;
 use maille_transport::Life;
@@ -24,7 +24,8 @@ pub(crate) struct Loop<'a> {
     outbox: Arc<Outbox>,
     publisher: Thread,
     last: Option<TickOutputs>,
-    degraded: bool,
+    /// the process that moves tissue is dead, starting, or silent
+    tissue_stands: bool,
     refused: u64,
 }
 
@@ -60,7 +61,7 @@ impl<'a> Loop<'a> {
             outbox,
             publisher,
             last: None,
-            degraded: false,
+            tissue_stands: false,
             refused: 0,
         })
     }
@@ -87,7 +88,9 @@ impl<'a> Loop<'a> {
         let surface = Isosurface::new(&snapshot, self.threshold_hu);
         let epoch = snapshot.epoch();
         // tissue stands as it was committed while its owner is silent: it is felt, and said
-        self.degraded = monotonic_ns.saturating_sub(control.service(Role::Deformation).heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS;
+        let owner = control.service(Role::Deformation);
+        self.tissue_stands = owner.incarnation.load(Relaxed) > 0
+            && (owner.state() != ServiceState::Ready || monotonic_ns.saturating_sub(owner.heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS);
         let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
         let out = self.core.tick(&inputs);
         self.operator.write(out.force_n, out.torque_n_mm);
@@ -132,7 +135,10 @@ impl<'a> Loop<'a> {
             force_n: out.force_n,
             penetration_mm: out.penetration_mm,
             radius_mm: self.core.config().radius_mm,
-            flags: flag(out.in_contact, TOOL_IN_CONTACT) | flag(self.operator.is_taken(), TOOL_TAKEN_OVER) | flag(out.fading, TOOL_FADING),
+            flags: flag(out.in_contact, TOOL_IN_CONTACT)
+                | flag(self.operator.is_taken(), TOOL_TAKEN_OVER)
+                | flag(out.fading, TOOL_FADING)
+                | flag(self.tissue_stands, TOOL_TISSUE_STANDS),
             epoch,
         };
         control.tool.store(&state);
@@ -157,7 +163,8 @@ impl<'a> Loop<'a> {
     pub fn count(&mut self, cell: &ServiceCell) {
         if let Some(out) = &self.last {
             cell.count(Counter::InContact, u64::from(out.in_contact));
-            cell.count(Counter::Degraded, u64::from(out.fading || self.degraded));
+            cell.count(Counter::Degraded, u64::from(out.fading));
+            cell.count(Counter::TissueStands, u64::from(self.tissue_stands));
         }
         cell.count(Counter::Refused, std::mem::take(&mut self.refused));
     }

@@ -22,6 +22,7 @@ pub mod doctor;
 pub mod enter;
 mod error;
 pub mod memory;
+mod output;
 mod patient;
 mod process;
 pub mod report;
@@ -41,23 +42,20 @@ use signals::Signals;
 use simulation::Simulation;
 use std::{
     fs,
-    io::Write as _,
     path::{Path, PathBuf},
     time::Duration,
 };
 
-/// Prints a line on standard output; a reader that went away is no reason to end a simulation.
+/// Says a line on standard output, without waiting for anybody to read it.
 macro_rules! say {
     ($($word:tt)*) => {
-        $crate::say_line(format_args!($($word)*))
+        $crate::output::line(format_args!($($word)*))
     };
 }
 pub(crate) use say;
 
-fn say_line(line: std::fmt::Arguments<'_>) {
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
-}
+/// How long the end of a run waits for somebody to read what it says.
+const LAST_WORDS: Duration = Duration::from_millis(500);
 
 /// What to run and how.
 #[derive(Clone, Debug, Default)]
@@ -117,6 +115,7 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     let outcome = simulation.watch(&mut signals, options.duration);
     let report = simulation.end(outcome.as_ref().unwrap_or(&"failure"));
     drop(simulation);
+    output::flush(LAST_WORDS);
     let report = finish(RunReport { scene: names.scene, volume: names.volume, ..report }, options)?;
     outcome.map(|_| report)
 }
@@ -131,6 +130,7 @@ fn finish(report: RunReport, options: &RunOptions) -> Result<RunReport, Supervis
     if !report.services.is_empty() {
         say!("{report}");
     }
+    output::flush(LAST_WORDS);
     Ok(report)
 }
 

@@ -16,7 +16,7 @@ use rustix::{
 };
 use std::{
     collections::VecDeque,
-    io::{self, PipeReader, Read as _, Write as _},
+    io::{self, PipeReader, Read as _},
     os::{
         fd::{AsFd, BorrowedFd, OwnedFd},
         unix::process::{CommandExt as _, ExitStatusExt as _},
@@ -104,7 +104,7 @@ impl Process {
                     for &byte in &bytes[..n] {
                         if byte == b'\n' || self.line.len() >= LINE_BYTES {
                             let line = String::from_utf8_lossy(&std::mem::take(&mut self.line)).into_owned();
-                            let _ = writeln!(io::stderr(), "{}: {line}", self.role.word());
+                            crate::output::error_line(format_args!("{}: {line}", self.role.word()));
                             self.tail.push_back(line);
                             if self.tail.len() > TAIL_LINES {
                                 self.tail.pop_front();

@@ -18,7 +18,7 @@
 //! | `services.haptic.tick_us`, `lateness_us` | compute of a tick; how late it began: `p50`, `p99`, `p999`, `max` |
 //! | `services.haptic.tick_histogram`, `lateness_histogram` | the same as pairs: up to so many µs (null: more than all), how many ticks |
 //! | `services.haptic.ticks`, `contact_share` | ticks after warm-up; part of them in contact |
-//! | `services.haptic.in_contact`, `degraded`, `allocations`, `realtime` | ticks in contact; ticks in a fallback; allocations in ticks; whether real-time rights were had |
+//! | `services.haptic.in_contact`, `degraded`, `tissue_stood`, `allocations`, `realtime` | ticks in contact; ticks with the force fading; ticks on tissue as last committed while deformation was away; allocations in ticks; whether real-time rights were had |
 //! | `services.deformation.commits`, `moved_elements` | transactions; elements moved, summed over them |
 //! | `services.deformation.step_us` | from a tool move to its commit |
 //! | `services.deformation.tool_moves`, `deferred`, `refused`, `inversion_failures` | moves received; commits put off for want of a slot; messages that could not be used; voxels given their nearest answer |
@@ -86,6 +86,8 @@ pub struct HapticReport {
     pub contact_share: f64,
     pub in_contact: u64,
     pub degraded: u64,
+    /// ticks on tissue as it was last committed, while deformation was away
+    pub tissue_stood: u64,
     pub allocations: u64,
     pub realtime: bool,
 }
@@ -193,6 +195,7 @@ fn own(role: Role, cell: &ServiceCell) -> Own {
             contact_share: n(Counter::InContact) as f64 / n(Counter::Iterations).max(1) as f64,
             in_contact: n(Counter::InContact),
             degraded: n(Counter::Degraded),
+            tissue_stood: n(Counter::TissueStands),
             allocations: n(Counter::Allocations),
             realtime: n(Counter::NotRealtime) == 0,
         }),

@@ -20,7 +20,7 @@ use maille_scene::{
     plan::{Machine, Plan, plan},
 };
 use maille_store::{StoreKeeper, StorePlan, StoreSizes};
-use maille_transport::{ControlMap, Domain, Node, Services, monotonic_ns};
+use maille_transport::{ControlMap, Domain, Node, Services, frame_pool_bytes, monotonic_ns};
 use maille_volume::{Volume, VolumeInfo};
 use std::{
     fs,
@@ -73,7 +73,8 @@ impl Simulation {
         let (plan, sizes) = plan_of(&scene, volume);
         resolve(&mut scene, &plan, volume)?;
         let segments = StorePlan { info: volume.info.clone(), sizes }.segments();
-        memory::check_space(segments.iter().map(|(_, bytes)| *bytes as u64).sum())?;
+        let frames = frame_pool_bytes(plan.frame_bytes);
+        memory::check_space(segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames)?;
 
         let domain = Files(Domain::fresh()?);
         let control = ControlMap::create(&domain.0)?;

@@ -17,7 +17,7 @@ use crate::{
 };
 use maille_contract::{
     ControlBlock, Role, ServiceState,
-    control::{HEARTBEAT_LATE_NS, PIN_IDLE, SUPERVISOR_BEAT_NS},
+    control::{HEARTBEAT_LATE_NS, PIN_IDLE, SUPERVISOR_BEAT_NS, SUPERVISOR_SILENT_NS},
 };
 use maille_transport::monotonic_ns;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -104,7 +104,13 @@ impl Watch<'_> {
         let (mut running_since, mut port, mut memory_due) = (None, 0, start_ns + MEMORY_PERIOD_NS / 2);
         loop {
             let now = monotonic_ns();
-            self.control.supervisor_heartbeat_ns.store(now, Relaxed);
+            let last = self.control.supervisor_heartbeat_ns.swap(now, Relaxed);
+            if last != 0 && now.saturating_sub(last) > SUPERVISOR_SILENT_NS {
+                say!(
+                    "supervisor   stood still for {:.1} s: services have ended themselves and are started again",
+                    (now - last) as f64 * 1e-9
+                );
+            }
             for post in posts.iter_mut() {
                 self.attend(post, now)?;
             }

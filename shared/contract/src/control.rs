@@ -22,12 +22,16 @@ pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille02");
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
 pub const PIN_IDLE: u64 = 0;
-/// A pin whose reader is about to choose an epoch: while it stands nothing is reclaimed.
+/// A pin whose reader is about to choose an epoch. The writer fills it with its own newest head before it reclaims, so that a reader stopped
+/// here holds back no more than any other.
 pub const PIN_PENDING: u64 = 1;
 /// A service that has not beaten for this long is shown as stopped [ns].
 pub const HEARTBEAT_LATE_NS: u64 = 500_000_000;
-/// The supervisor beats at least this often; a service that misses ten beats ends itself [ns].
+/// The supervisor beats at least this often [ns].
 pub const SUPERVISOR_BEAT_NS: u64 = 50_000_000;
+/// A service whose supervisor has not beaten for so long ends itself [ns]: it hangs, or is stopped. A supervisor that dies is learnt from the
+/// kernel, long before; and one that is merely short of time on a busy machine must not cost a simulation.
+pub const SUPERVISOR_SILENT_NS: u64 = 3_000_000_000;
 
 const _: () = assert!(PINS_PER_ROLE * crate::Role::ALL.len() <= PINS);
 
@@ -91,7 +95,7 @@ pub enum Counter {
     Allocations = 7,
     /// ticks in contact (haptic)
     InContact = 8,
-    /// ticks in which a declared fallback was used: stale tissue, stale hand, invalid pose (haptic)
+    /// ticks in which the force was being faded: stale hand, invalid pose, no tissue (haptic)
     Degraded = 9,
     /// voxels that the mapper could not invert and gave their nearest answer (deformation)
     Failures = 10,
@@ -103,6 +107,8 @@ pub enum Counter {
     BytesSent = 13,
     /// tool moves received (deformation)
     Received = 14,
+    /// ticks on tissue as it was last committed, because who moves it is dead, starting or silent (haptic)
+    TissueStands = 15,
 }
 
 /// Number of counters.
@@ -240,7 +246,7 @@ impl ControlBlock {
     /// Whether a service should end: the run stops, or the supervisor no longer beats.
     pub fn should_end(&self, monotonic_ns: u64) -> bool {
         self.run_state() == RunState::Stopping
-            || monotonic_ns.saturating_sub(self.supervisor_heartbeat_ns.load(Relaxed)) > 10 * SUPERVISOR_BEAT_NS
+            || monotonic_ns.saturating_sub(self.supervisor_heartbeat_ns.load(Relaxed)) > SUPERVISOR_SILENT_NS
     }
 }
 

@@ -26,6 +26,8 @@ pub const TOOL_IN_CONTACT: u64 = 1;
 pub const TOOL_TAKEN_OVER: u64 = 1 << 1;
 /// The force is being faded: an input is stale or invalid.
 pub const TOOL_FADING: u64 = 1 << 2;
+/// The tissue that is felt stands as it was last committed: the process that moves it is dead, starting or silent.
+pub const TOOL_TISSUE_STANDS: u64 = 1 << 3;
 
 /// Pose and force of the tool. Writer: haptic, a few hundred times a second. Readers: rendering, console.
 #[repr(C)]

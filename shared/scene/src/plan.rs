@@ -75,6 +75,8 @@ pub struct Plan {
     pub version_slots: usize,
     /// slots of displacement versions
     pub displacement_slots: usize,
+    /// bytes of a frame, all views
+    pub frame_bytes: usize,
     /// knobs of the active effects with their values
     pub knobs: Vec<(&'static Knob, f64)>,
     /// panels of the page
@@ -136,6 +138,10 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
         segments.push(of_bricks(channel.name, channel.meaning, if moves { displacement_slots } else { bricks }, channel));
     }
 
+    let pixels = |[w, h]: [usize; 2]| 3 * w * h;
+    let sections = if scene.has_effect("sections") { 3 * pixels(scene.rendering.section_size) } else { 0 };
+    let frame_bytes = pixels(scene.rendering.size) + sections;
+
     let knobs = KNOBS.iter().filter(|k| effects.iter().any(|e| e.name == k.effect)).map(|k| (k, (k.get)(scene))).collect();
     let panels = if scene.console.enabled { effects.iter().flat_map(|e| e.panels).copied().collect() } else { Vec::new() };
     Plan {
@@ -149,6 +155,7 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
         spare_slots,
         version_slots,
         displacement_slots,
+        frame_bytes,
         knobs,
         panels,
     }

@@ -11,7 +11,10 @@
 //!   instructions holds one epoch, never all of them, and neither side ever waits or tries again.
 //! - head is stored with release and loaded with acquire: what a commit wrote comes before what its readers read.
 //! - a pin is let go with release, and the writer loads pins with acquire (the compare-and-swaps in between continue the
-//!   release sequence): what a reader read comes before what the writer writes there next.
+//!   release sequence): what a reader read comes before what the writer writes there next. Where another reader takes the
+//!   same pin and lets it go, its plain store ends that sequence; then the first reader's reads are ordered by the second one's
+//!   SeqCst fence in [`pin`], after its compare-and-swap has read what the first one stored, and by its own release. So that
+//!   fence has this second duty, and may not be weakened.
 
 use maille_contract::control::{PIN_IDLE, PIN_PENDING, PINS, Pin};
 use maille_contract::index::ROOT_BITS;

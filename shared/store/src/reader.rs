@@ -42,7 +42,7 @@ pub fn volume_info(domain: &Domain) -> Result<VolumeInfo, StoreError> {
 }
 
 impl Reader {
-    /// Maps the store read-only; bricks are prefaulted, so that no tick and no frame waits for a page.
+    /// Maps the store read-only. Pages come as they are touched, or all at once by [`Self::prefault`].
     ///
     /// # Errors
     /// When a segment is missing, truncated or of another version.
@@ -67,8 +67,8 @@ impl Reader {
         let control = ControlMap::open(domain)?;
         let (index, info, layout) = IndexMap::open(domain, Access::Read)?;
         Ok(Self {
-            rest: Slots::open(domain, segment::REST, layout.count(), SPECS[0].slot_bytes, Access::Read, true)?,
-            slots: open_slots(domain, &index, Access::Read, true)?,
+            rest: Slots::open(domain, segment::REST, layout.count(), SPECS[0].slot_bytes, Access::Read)?,
+            slots: open_slots(domain, &index, Access::Read)?,
             first: Channel::ALL.map(|c| first_entry(&index.layout, c)),
             control,
             index,
@@ -76,6 +76,17 @@ impl Reader {
             layout,
             pins,
         })
+    }
+
+    /// Maps every page of what a tick or a frame looks at, so that none waits for one. Takes some 100 ms a GiB: for a thread beside the
+    /// work, as a process that comes back must be at work before that.
+    pub fn prefault(&self) {
+        self.rest.prefault();
+        for (slots, spec) in self.slots.iter().zip(&SPECS) {
+            if spec.prefault {
+                slots.prefault();
+            }
+        }
     }
 
     /// The control block.

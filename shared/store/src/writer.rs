@@ -85,8 +85,8 @@ impl Writer {
         let (index, info, layout) = IndexMap::open(domain, Access::ReadWrite)?;
         let entries: u64 = index.layout.channels.iter().map(|c| c.entry_count).sum();
         let mut writer = Self {
-            rest: Slots::open(domain, segment::REST, layout.count(), SPECS[0].slot_bytes, Access::Read, true)?,
-            slots: open_slots(domain, &index, Access::ReadWrite, false)?,
+            rest: Slots::open(domain, segment::REST, layout.count(), SPECS[0].slot_bytes, Access::Read)?,
+            slots: open_slots(domain, &index, Access::ReadWrite)?,
             first: Channel::ALL.map(|c| first_entry(&index.layout, c)),
             control,
             index,
@@ -261,12 +261,12 @@ impl Writer {
 }
 
 /// Maps the slots of every channel that there is.
-pub(crate) fn open_slots(domain: &Domain, index: &IndexMap, access: Access, prefault: bool) -> Result<[Slots; CHANNELS], StoreError> {
+pub(crate) fn open_slots(domain: &Domain, index: &IndexMap, access: Access) -> Result<[Slots; CHANNELS], StoreError> {
     let mut slots = Vec::with_capacity(CHANNELS);
     for (n, (spec, channel)) in SPECS.iter().zip(&index.layout.channels).enumerate() {
         let rest = if n == 0 { channel.entry_count } else { 0 };
         let count = (channel.slot_count - rest) as usize;
-        slots.push(Slots::open(domain, spec.segment, count, spec.slot_bytes, access, prefault && spec.prefault)?);
+        slots.push(Slots::open(domain, spec.segment, count, spec.slot_bytes, access)?);
     }
     Ok(slots.try_into().unwrap_or_else(|_| unreachable!("one for each channel")))
 }

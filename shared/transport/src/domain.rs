@@ -3,7 +3,8 @@
 //! The lock is an advisory lock on `/dev/shm/<domain>.lock`, held by the supervisor's open file: the kernel drops it however
 //! the supervisor dies, so a domain whose lock can be had is dead, and one whose lock is held is never cleaned away.
 
-use crate::TransportError;
+use crate::{ControlMap, TransportError};
+use maille_contract::control::SUPERVISOR_SILENT_NS;
 use rustix::fs::{FlockOperation, flock};
 use std::{
     fs::{self, File},
@@ -118,11 +119,25 @@ impl Domain {
         format!("{}_{segment}", self.name)
     }
 
-    /// Whether some supervisor holds the domain's lock: this one, or another process.
+    /// Whether some supervisor holds the domain's lock: this one, or another process. Where somebody has taken the lock's file away, the
+    /// supervisor's beat is asked.
     pub fn is_alive(&self) -> bool {
-        self.lock.is_some()
-            || File::open(lock_path(&self.name))
-                .is_ok_and(|file| matches!(flock(&file, FlockOperation::NonBlockingLockShared), Err(rustix::io::Errno::WOULDBLOCK)))
+        if self.lock.is_some() {
+            return true;
+        }
+        match File::open(lock_path(&self.name)) {
+            Ok(file) => matches!(flock(&file, FlockOperation::NonBlockingLockShared), Err(rustix::io::Errno::WOULDBLOCK)),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => self.beats(),
+            Err(_) => false,
+        }
+    }
+
+    /// Whether a supervisor has beaten a moment ago.
+    fn beats(&self) -> bool {
+        ControlMap::open(self).is_ok_and(|control| {
+            let beat = control.supervisor_heartbeat_ns.load(std::sync::atomic::Ordering::Relaxed);
+            beat != 0 && crate::monotonic_ns().saturating_sub(beat) < SUPERVISOR_SILENT_NS
+        })
     }
 
     /// Removes everything of the domain from /dev/shm and says how many files went. The lock goes last.

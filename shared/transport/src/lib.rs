@@ -23,7 +23,7 @@ pub use domain::Domain;
 pub use events::{Event, Listener, Notifier};
 pub use life::Life;
 pub use maille_realtime::monotonic_ns;
-pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber, Topic};
+pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber, Topic, frame_pool_bytes};
 pub use segment::{Access, ControlMap, Segment};
 
 use std::path::PathBuf;

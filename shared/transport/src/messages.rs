@@ -80,6 +80,8 @@ pub(crate) fn retry<T, E: Debug>(action: &str, mut attempt: impl FnMut() -> Resu
 /// A process's place in the domain. Ports stay on the thread that made them.
 pub struct Node {
     pub(crate) node: IceNode<Ice>,
+    /// name of the domain
+    domain: String,
 }
 
 /// The services of a domain, held open by the supervisor so that they outlive every other process.
@@ -109,7 +111,7 @@ impl Node {
         ice(|| format!("read its configuration {path}"), Config::setup_global_config_from_file(&path))?;
         let name = ice(|| format!("name a node {name:?}"), NodeName::new(name))?;
         let builder = || NodeBuilder::new().name(&name).signal_handling_mode(SignalHandlingMode::Disabled).create::<Ice>();
-        Ok(Self { node: ice(|| "create a node".into(), builder())? })
+        Ok(Self { node: ice(|| "create a node".into(), builder())?, domain: domain.name().to_owned() })
     }
 
     /// Makes all services. Supervisor only; they live while the returned value does.
@@ -185,6 +187,7 @@ impl Node {
             let builder = service.publisher_builder().max_loaned_samples(2);
             builder.backpressure_strategy(BackpressureStrategy::DiscardData).create()
         })?;
+        reserve_pools(&self.domain)?;
         Ok(Publisher { port })
     }
 
@@ -212,6 +215,7 @@ impl Node {
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
                 .create()
         })?;
+        reserve_pools(&self.domain)?;
         Ok(FramePublisher { port })
     }
 
@@ -231,6 +235,36 @@ impl Node {
 }
 
 const FRAME_SUBSCRIBERS: usize = 2;
+
+/// Bytes that the pool of frames takes in /dev/shm: what subscribers may hold and have queued, what is being drawn, and what
+/// iceoryx2 adds for itself, on the safe side.
+pub fn frame_pool_bytes(frame_bytes: usize) -> u64 {
+    let samples = FRAME_SUBSCRIBERS * (BORROWED + 1) + 4;
+    samples as u64 * (frame_bytes as u64 + 4096)
+}
+
+/// Takes the memory of this process's pools now: iceoryx2 makes them sparse, and a full /dev/shm would end the process by a signal when
+/// it first writes there.
+fn reserve_pools(domain: &str) -> Result<(), TransportError> {
+    let ours = |name: &str| name.strip_prefix(domain).is_some_and(|rest| rest.starts_with('_') && rest.contains('.'));
+    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+        if !entry.file_name().to_str().is_some_and(ours) {
+            continue;
+        }
+        let Ok(file) = std::fs::OpenOptions::new().write(true).open(entry.path()) else { continue };
+        let bytes = file.metadata().map_or(0, |m| m.len());
+        if bytes > 0
+            && let Err(rustix::io::Errno::NOSPC) = rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::KEEP_SIZE, 0, bytes)
+        {
+            return Err(TransportError::Full {
+                segment: "messages and frames".into(),
+                needed_mib: bytes.div_ceil(1 << 20),
+                free_mib: crate::segment::free_shm_bytes() >> 20,
+            });
+        }
+    }
+    Ok(())
+}
 
 pub(crate) fn service_name(topic: &str) -> Result<ServiceName, TransportError> {
     ice(|| format!("name the service {topic}"), ServiceName::new(topic))

@@ -85,7 +85,7 @@ impl Segment {
         let memory = SharedMemoryBuilder::new(&file_name(domain, segment)?).open_existing(mode).map_err(|e| TransportError::Segment {
             segment: segment.into(),
             action: "opened",
-            reason: format!("{e:?}"),
+            reason: why(domain, segment).unwrap_or_else(|| format!("{e:?}")),
         })?;
         Ok(Self { memory, access })
     }
@@ -118,6 +118,16 @@ impl Segment {
         let done = unsafe { rustix::mm::madvise(self.base().as_ptr().cast(), self.len(), advice) };
         // before Linux 5.14 there is no such advice; then pages come as they are touched
         let _ = done;
+    }
+}
+
+/// In words, what can be seen of a segment that cannot be opened.
+fn why(domain: &Domain, segment: &str) -> Option<String> {
+    match std::fs::symlink_metadata(Path::new("/dev/shm").join(domain.segment_name(segment))) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Some("it does not exist: the run has ended or lost it".into()),
+        Ok(found) if !found.is_file() => Some("something else than a segment lies in its place".into()),
+        Ok(found) if found.len() == 0 => Some("it is cut short: it has no bytes".into()),
+        _ => None,
     }
 }
 

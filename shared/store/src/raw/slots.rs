@@ -21,25 +21,20 @@ impl Slots {
         Ok(Self { memory: segment.map(Memory::from), count, stride })
     }
 
-    pub fn open(
-        domain: &Domain,
-        name: &'static str,
-        count: usize,
-        stride: usize,
-        access: Access,
-        prefault: bool,
-    ) -> Result<Self, StoreError> {
+    pub fn open(domain: &Domain, name: &'static str, count: usize, stride: usize, access: Access) -> Result<Self, StoreError> {
         let segment = (count > 0).then(|| Segment::open(domain, name, access)).transpose()?;
         if let Some(s) = &segment {
             let expected = count.saturating_mul(stride);
             if s.len() < expected {
                 return Err(StoreError::Size { segment: name, found: s.len(), expected });
             }
-            if prefault {
-                s.prefault();
-            }
         }
         Ok(Self { memory: segment.map(Memory::from), count, stride })
+    }
+
+    /// Maps every page now.
+    pub fn prefault(&self) {
+        self.memory.iter().for_each(Memory::prefault);
     }
 
     /// Address of a slot.
