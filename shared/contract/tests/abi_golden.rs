@@ -57,7 +57,10 @@ fn shared_words_keep_their_sizes_and_offsets() {
     golden!(SlotRecord, 16, born: 0, superseded: 8);
     golden!(IndexLayout, 360, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 336, root_count: 344, leaf_count: 352);
     assert_eq!((size_of::<IndexHeader>(), align_of::<IndexHeader>()), (512, 128));
-    assert_eq!((offset_of!(IndexHeader, magic), offset_of!(IndexHeader, checksum), offset_of!(IndexHeader, layout), offset_of!(IndexHeader, head)), (0, 8, 16, 384));
+    assert_eq!(
+        (offset_of!(IndexHeader, magic), offset_of!(IndexHeader, checksum), offset_of!(IndexHeader, layout), offset_of!(IndexHeader, head)),
+        (0, 8, 16, 384)
+    );
     golden!(RegionHeader, 104, magic: 0, checksum: 8, kind: 16, header_bytes: 80, body_offset: 88, body_bytes: 96);
     assert_eq!(Channel::ALL.map(|c| c as usize), [0, 1, 2, 3, 4, 5]);
 }
