@@ -34,8 +34,8 @@ pub(crate) fn options(scene: &Scene) -> Result<Options, HapticError> {
 }
 
 /// Opens it, its origin at the first way point where the scene says no other. A device that is not plugged in is waited for.
-pub(crate) fn open(kind: Kind, mut options: Options, way: &Waypoints) -> Result<RemoteDevice, HapticError> {
-    if options.mounting.origin_mm == [0.0; 3] {
+pub(crate) fn open(kind: Kind, mut options: Options, scene: &Scene, way: &Waypoints) -> Result<RemoteDevice, HapticError> {
+    if scene.device.origin_mm.is_none() {
         options.mounting.origin_mm = way.at(0.0).position_mm;
     }
     Ok(maille_device::open(kind, &options)?)

@@ -48,7 +48,7 @@ impl<'a> Loop<'a> {
         let way =
             scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
         let way = way.ok_or(HapticError::NoTool)?;
-        let real = real.map(|(kind, options)| device::open(kind, options, &way)).transpose()?;
+        let real = real.map(|(kind, options)| device::open(kind, options, scene, &way)).transpose()?;
         Ok(Self {
             reader,
             core: HapticCore::new(config),

@@ -101,7 +101,8 @@ pub struct DeviceSection {
     /// from the device's axes to the patient's, row by row, a rotation
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rotation: Option<[[f64; 3]; 3]>,
-    /// millimetres in the patient for a millimetre of the hand, 0.1 to 10; by default 1
+    /// millimetres in the patient for a millimetre of the hand, 0.1 to 1, by default 1; above 1 the hand would feel a coupling stiffer than
+    /// the one that is stable on its device
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
 }

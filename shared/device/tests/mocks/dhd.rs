@@ -1,5 +1,5 @@
 //! A stand-in for libdhd: one device. Built as a shared object by `tests/libraries.rs`.
-#![allow(non_snake_case, clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks)]
+#![allow(non_snake_case, clippy::missing_safety_doc)]
 
 use std::ffi::{c_char, c_double, c_int, c_uchar, c_uint};
 use std::sync::Mutex;
@@ -17,16 +17,20 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
 #[unsafe(no_mangle)] pub extern "C" fn dhdClose(_id: c_char) -> c_int { STATE.lock().unwrap().open = false; 0 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetPosition(x: *mut c_double, y: *mut c_double, z: *mut c_double, id: c_char) -> c_int {
     let p = STATE.lock().unwrap().position;
+    // SAFETY: the caller gives three places for a double, as libdhd asks.
     unsafe { (*x, *y, *z) = (p[0], p[1], p[2]) };
     if id == 3 { there() } else { -1 }
 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetLinearVelocity(x: *mut c_double, y: *mut c_double, z: *mut c_double, _id: c_char) -> c_int {
-    unsafe { *x = 0.1; *y = 0.2; *z = 0.3 };
+    // SAFETY: the caller gives three places for a double, as libdhd asks.
+    unsafe { (*x, *y, *z) = (0.1, 0.2, 0.3) };
     there()
 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetOrientationFrame(frame: *mut [c_double; 3], _id: c_char) -> c_int {
     // a quarter turn about z, row by row
-    for (n, row) in [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]].iter().enumerate() { unsafe { *frame.add(n) = *row } }
+    let turn = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]];
+    // SAFETY: the caller gives place for nine doubles, three rows of three, as libdhd asks.
+    unsafe { std::ptr::copy_nonoverlapping(turn.as_ptr(), frame, 3) };
     there()
 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdSetForceAndTorqueAndGripperForce(fx: c_double, fy: c_double, fz: c_double, tx: c_double, ty: c_double, tz: c_double, _g: c_double, _id: c_char) -> c_int {
@@ -39,7 +43,11 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
 #[unsafe(no_mangle)] pub extern "C" fn dhdErrorGetLastStr() -> *const c_char { c"no device".as_ptr() }
 // for the test
 #[unsafe(no_mangle)] pub extern "C" fn mock_plug(on: c_int) { STATE.lock().unwrap().plugged = on != 0; }
-#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) { for n in 0..3 { unsafe { *to.add(n) = STATE.lock().unwrap().wrench[n] } } }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) {
+    let wrench = STATE.lock().unwrap().wrench;
+    // SAFETY: the test gives place for three doubles.
+    unsafe { std::ptr::copy_nonoverlapping(wrench.as_ptr(), to, 3) };
+}
 #[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { c_int::from(STATE.lock().unwrap().open) }
 #[unsafe(no_mangle)]
 pub extern "C" fn mock_move(x: c_double, y: c_double, z: c_double) {

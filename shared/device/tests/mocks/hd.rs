@@ -1,5 +1,5 @@
 //! A stand-in for libHD: one device that is a mass in the mind of the test. Built as a shared object by `tests/libraries.rs`.
-#![allow(non_snake_case, clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks)]
+#![allow(non_snake_case, clippy::missing_safety_doc)]
 
 use std::ffi::{c_char, c_double, c_int, c_uint, c_ushort, c_void};
 use std::sync::Mutex;
@@ -37,16 +37,27 @@ pub struct HDErrorInfo { code: c_uint, internal: c_int, device: c_uint }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn hdGetDoublev(what: c_uint, to: *mut c_double) {
     let s = STATE.lock().unwrap();
     let p = s.position;
-    match what {
-        // a quarter turn about z, then the place
-        0x2052 => for (n, v) in [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, p[0], p[1], p[2], 1.0].iter().enumerate() { unsafe { *to.add(n) = *v } },
-        0x2051 => for n in 0..3 { unsafe { *to.add(n) = 10.0 * (n as f64 + 1.0) } },
-        _ => {}
-    }
+    // a quarter turn about z, then the place
+    let transform = [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, p[0], p[1], p[2], 1.0];
+    let numbers: &[f64] = match what {
+        0x2052 => &transform,
+        0x2051 => &[10.0, 20.0, 30.0],
+        _ => &[],
+    };
+    // SAFETY: the caller gives place for what it asks, 16 or 3 doubles, as libHD does.
+    unsafe { std::ptr::copy_nonoverlapping(numbers.as_ptr(), to, numbers.len()) };
 }
-#[unsafe(no_mangle)] pub unsafe extern "C" fn hdGetIntegerv(_what: c_uint, to: *mut c_int) { unsafe { *to = STATE.lock().unwrap().buttons } }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn hdGetIntegerv(_what: c_uint, to: *mut c_int) {
+    let buttons = STATE.lock().unwrap().buttons;
+    // SAFETY: the caller gives place for an int, as libHD asks.
+    unsafe { *to = buttons };
+}
 #[unsafe(no_mangle)] pub unsafe extern "C" fn hdSetDoublev(what: c_uint, from: *const c_double) {
-    if what == 0x2700 { for n in 0..3 { let v = unsafe { *from.add(n) }; STATE.lock().unwrap().force[n] = v; } }
+    if what == 0x2700 {
+        // SAFETY: the caller gives a force, three doubles, as libHD asks.
+        let force = unsafe { *from.cast::<[f64; 3]>() };
+        STATE.lock().unwrap().force = force;
+    }
 }
 #[unsafe(no_mangle)] pub extern "C" fn hdEnable(_what: c_uint) {}
 #[unsafe(no_mangle)] pub extern "C" fn hdGetError() -> HDErrorInfo {
