@@ -188,7 +188,8 @@ fn what_is_drawn_are_the_bytes_in_the_segment_now() {
             let at = std::ptr::from_ref(snapshot.brick(id)) as usize;
             if range.contains(&at) {
                 let voxels = snapshot.brick(id).voxels.map(|v| if v > 0 { 1200 } else { v });
-                file.write_all_at(bytemuck::cast_slice(&voxels), (at - range.start) as u64).unwrap();
+                file.write_all_at(bytemuck::cast_slice(&voxels), (maille_contract::segment_header::BODY_OFFSET + at - range.start) as u64)
+                    .unwrap();
             }
         }
         assert!(world.draw(&mut composer, &snapshot) != before, "{segment}: the picture is made of other bytes than those that lie there");

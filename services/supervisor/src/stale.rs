@@ -39,6 +39,7 @@ impl fmt::Display for Removed {
 /// cleaned by somebody else at the same time.
 pub fn clean_dead_runs() -> Result<Vec<Removed>, SupervisorError> {
     let mut removed = Vec::new();
+    Domain::remove_unfinished();
     for domain in Domain::list().into_iter().filter(|domain| !domain.is_alive()) {
         let mut orphans = Vec::new();
         for (pid, role) in services_of(domain.name()) {

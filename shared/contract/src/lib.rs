@@ -18,6 +18,7 @@ pub mod index;
 pub mod messages;
 pub mod names;
 pub mod probe;
+pub mod segment_header;
 
 pub use control::{ControlBlock, RunState, ServiceCell, ServiceState};
 pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, ViewState};

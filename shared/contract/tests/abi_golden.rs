@@ -8,6 +8,7 @@ use maille_contract::{
     index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
     probe::{Ping, Pong},
+    segment_header::{BODY_OFFSET, SEGMENT_MAGIC, SegmentHeader},
 };
 use std::mem::{align_of, offset_of, size_of};
 
@@ -61,6 +62,8 @@ fn shared_words_keep_their_sizes_and_offsets() {
         (offset_of!(IndexHeader, magic), offset_of!(IndexHeader, checksum), offset_of!(IndexHeader, layout), offset_of!(IndexHeader, head)),
         (0, 8, 16, 384)
     );
+    golden!(SegmentHeader, 32, magic: 0, layout: 8, body_bytes: 16, checksum: 24);
+    assert_eq!((BODY_OFFSET, SEGMENT_MAGIC.to_le_bytes()), (4096, *b"mailseg1"));
     golden!(RegionHeader, 104, magic: 0, checksum: 8, kind: 16, header_bytes: 80, body_offset: 88, body_bytes: 96);
     assert_eq!(Channel::ALL.map(|c| c as usize), [0, 1, 2, 3, 4, 5]);
 }

@@ -1,8 +1,11 @@
 //! Sizes and offsets of the store's segments, computed alike by whoever makes and whoever opens it.
 
 use crate::{StoreError, channel::SPECS};
-use maille_contract::index::{ABSENT, CHANNELS, Channel, ChannelLayout, IndexHeader, IndexLayout, LEAF_LEN, ROOT_BITS, SlotRecord};
+use maille_contract::index::{
+    ABSENT, CHANNELS, Channel, ChannelLayout, INDEX_MAGIC, IndexHeader, IndexLayout, LEAF_LEN, ROOT_BITS, SlotRecord,
+};
 use maille_contract::names::segment;
+use maille_contract::segment_header::{BODY_OFFSET, checksum, layout_sum};
 use maille_volume::{BrickLayout, Grid, Rescale, VolumeInfo, brick};
 
 /// Bytes of the state block.
@@ -121,7 +124,7 @@ pub(crate) fn first_entry(l: &IndexLayout, channel: Channel) -> usize {
     l.channels[..channel as usize].iter().map(|c| c.entry_count as usize).sum()
 }
 
-/// Bytes of each segment, by name, read-only regions not among them.
+/// Bytes of each segment with its header page, by name, read-only regions not among them.
 pub(crate) fn segments(l: &IndexLayout) -> Vec<(&'static str, usize)> {
     let bricks = l.channels[0].entry_count as usize;
     let mut segments = vec![(segment::INDEX, IndexOffsets::new(l).total), (segment::REST, bricks * SPECS[0].slot_bytes)];
@@ -131,12 +134,17 @@ pub(crate) fn segments(l: &IndexLayout) -> Vec<(&'static str, usize)> {
             segments.push((spec.segment, slots.saturating_mul(spec.slot_bytes)));
         }
     }
-    segments
+    segments.into_iter().map(|(name, bytes)| (name, bytes.saturating_add(BODY_OFFSET))).collect()
 }
 
-/// FNV-1a, 64 bits.
-pub(crate) fn checksum(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xCBF2_9CE4_8422_2325, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01B3))
+/// Checksum of the layout of a segment of slots.
+pub(crate) fn slots_sum(segment: &str, count: usize, stride: usize) -> u64 {
+    layout_sum(segment, &[INDEX_MAGIC, count as u64, stride as u64])
+}
+
+/// Checksum of the layout of the index segment as far as it is known before it is opened; the rest has a checksum of its own.
+pub(crate) fn index_sum() -> u64 {
+    layout_sum(segment::INDEX, &[INDEX_MAGIC, size_of::<IndexHeader>() as u64])
 }
 
 /// The layout, if this program can work with it.

@@ -6,10 +6,13 @@
 //!
 //! Not here: what the bytes mean (whoever defines the kind; if two processes see them, the contract).
 
-use crate::{StoreError, StoreKeeper, layout::checksum, raw::RegionMap};
+use crate::{StoreError, StoreKeeper, raw::RegionMap};
 use bytemuck::Pod;
 use maille_contract::index::{REGION_HEADER_OFFSET, REGION_KIND_BYTES, REGION_MAGIC, RegionHeader};
-use maille_contract::names::segment;
+use maille_contract::{
+    names::segment,
+    segment_header::{BODY_OFFSET, checksum},
+};
 use maille_transport::Domain;
 use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 
@@ -28,7 +31,7 @@ pub struct Region<H: Pod> {
 impl<H: Pod> Region<H> {
     /// Bytes of the segment of a region whose body has so many, for the plan.
     pub const fn segment_bytes(body_bytes: usize) -> usize {
-        body_offset::<H>() + body_bytes
+        BODY_OFFSET + body_offset::<H>() + body_bytes
     }
 
     /// Maps a region read-only.
@@ -100,7 +103,7 @@ impl StoreKeeper {
         body_bytes: usize,
         fill: impl FnOnce(&mut [u8]),
     ) -> Result<(), StoreError> {
-        let bytes = Region::<H>::segment_bytes(body_bytes);
+        let bytes = body_offset::<H>() + body_bytes;
         let map = RegionMap::create(domain, &segment_name(name, kind)?, bytes)?;
         self.regions.push(make(map, kind, header, body_bytes, fill));
         Ok(())

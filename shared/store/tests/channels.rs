@@ -1,11 +1,11 @@
 //! Channels beside the voxels, and read-only regions: they cost nothing where the plan does not ask for them, share the transaction of
 //! the voxels where it does, and are refused when damaged.
 
-use maille_contract::{Role, index::Channel};
+use maille_contract::{Role, index::Channel, segment_header::BODY_OFFSET};
 use maille_store::{
     CommitOutcome, Cuts, Displacement, Labels, Plastic, Reader, Region, StoreError, StoreKeeper, StorePlan, StoreSizes, Writer,
 };
-use maille_transport::{ControlMap, Domain};
+use maille_transport::{ControlMap, Domain, TransportError};
 use maille_volume::{BrickSource, Grid, Rescale, Volume};
 use std::{os::unix::fs::FileExt, path::PathBuf};
 
@@ -159,7 +159,7 @@ fn a_region_is_read_as_it_was_made_and_in_place() {
 #[test]
 fn a_region_of_another_kind_or_damaged_is_refused_with_a_sentence() {
     let says = |world: &World, kind: &str| match Region::<FieldHeader>::open(&world.domain, "breathing-0", kind) {
-        Err(error @ StoreError::Region { .. }) => error.to_string(),
+        Err(error @ (StoreError::Region { .. } | StoreError::Transport(TransportError::Layout { .. }))) => error.to_string(),
         Err(error) => panic!("{error}"),
         Ok(_) => panic!("it was opened"),
     };
@@ -182,11 +182,11 @@ fn a_region_of_another_kind_or_damaged_is_refused_with_a_sentence() {
     for (offset, word, sentence) in damages {
         let world = with_region();
         let file = std::fs::OpenOptions::new().write(true).open(world.path("region-breathing-0")).unwrap();
-        file.write_all_at(&word.to_le_bytes(), offset).unwrap();
+        file.write_all_at(&word.to_le_bytes(), BODY_OFFSET as u64 + offset).unwrap();
         let said = says(&world, KIND);
         assert!(said.contains(sentence), "{offset}: {said}");
     }
-    for length in [1, 100, 200, 1000] {
+    for length in [1, 100, 200, 1000, BODY_OFFSET as u64 + 64, BODY_OFFSET as u64 + 1000] {
         let world = with_region();
         std::fs::OpenOptions::new().write(true).open(world.path("region-breathing-0")).unwrap().set_len(length).unwrap();
         assert!(says(&world, KIND).contains("truncated"), "{length}");

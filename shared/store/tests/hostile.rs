@@ -4,6 +4,7 @@
 use maille_contract::{
     Role,
     index::{ABSENT, IndexHeader, IndexLayout},
+    segment_header::{BODY_OFFSET, checksum},
 };
 use maille_store::{Cuts, Labels, Plastic, Reader, StoreError, StoreKeeper, StoreSizes, Writer};
 use maille_transport::{ControlMap, Domain};
@@ -58,20 +59,19 @@ impl World {
 
     fn word(&self, at: usize) -> u64 {
         let mut bytes = [0; 8];
-        self.file("index").read_exact_at(&mut bytes, at as u64).unwrap();
+        self.file("index").read_exact_at(&mut bytes, (BODY_OFFSET + at) as u64).unwrap();
         u64::from_ne_bytes(bytes)
     }
 
     fn write(&self, at: usize, word: u64) {
-        self.file("index").write_all_at(&word.to_ne_bytes(), at as u64).unwrap();
+        self.file("index").write_all_at(&word.to_ne_bytes(), (BODY_OFFSET + at) as u64).unwrap();
     }
 
     /// Makes the checksum agree with the layout: who damages on purpose can do that as well.
     fn sum_again(&self) {
         let mut bytes = vec![0; size_of::<IndexLayout>()];
-        self.file("index").read_exact_at(&mut bytes, LAYOUT as u64).unwrap();
-        let sum = bytes.iter().fold(0xCBF2_9CE4_8422_2325u64, |h, &b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01B3));
-        self.write(offset_of!(IndexHeader, checksum), sum);
+        self.file("index").read_exact_at(&mut bytes, (BODY_OFFSET + LAYOUT) as u64).unwrap();
+        self.write(offset_of!(IndexHeader, checksum), checksum(&bytes));
     }
 
     /// What reader and writer say when they open; neither panics.
@@ -112,7 +112,7 @@ fn every_segment_cut_short_is_refused_by_its_name() {
         let world = World::new();
         let file = world.file(segment);
         let length = file.metadata().unwrap().len();
-        for shorter in [length - 1, length / 2, 64, 1] {
+        for shorter in [length - 1, length / 2, 4095, 64, 1] {
             file.set_len(shorter).unwrap();
             for said in world.refusals() {
                 let said = said.unwrap_or_else(|| panic!("{segment} of {shorter} bytes instead of {length} was opened"));
@@ -193,7 +193,7 @@ fn indices_damaged_while_processes_run_are_found_before_they_are_used() {
     let world = World::new();
     let (reader, mut writer) = (Reader::open(&world.domain, Role::Haptic).unwrap(), Writer::open(&world.domain).unwrap());
     let truth = read_all(&reader);
-    let words_of_pages = (world.file("index").metadata().unwrap().len() as usize - ROOTS) / 4;
+    let words_of_pages = (world.file("index").metadata().unwrap().len() as usize - BODY_OFFSET - ROOTS) / 4;
     let mut random = 1u64;
     let mut next = move || {
         random = random.wrapping_add(0x9E37_79B9_7F4A_7C15);
@@ -217,14 +217,14 @@ fn indices_damaged_while_processes_run_are_found_before_they_are_used() {
         let at = if round % 2 == 0 { head_root * root_len + next() as usize % root_len } else { next() as usize % words_of_pages };
         let at = ROOTS + at * 4;
         let mut right = [0; 4];
-        world.file("index").read_exact_at(&mut right, at as u64).unwrap();
+        world.file("index").read_exact_at(&mut right, (BODY_OFFSET + at) as u64).unwrap();
         let wrong = match next() % 4 {
             0 => u32::MAX - 1,
             1 => (next() % 4096) as u32,
             2 => u32::from_ne_bytes(right) ^ 1 << (next() % 32),
             _ => next() as u32,
         };
-        world.file("index").write_all_at(&wrong.to_ne_bytes(), at as u64).unwrap();
+        world.file("index").write_all_at(&wrong.to_ne_bytes(), (BODY_OFFSET + at) as u64).unwrap();
         match quietly(|| catch_unwind(AssertUnwindSafe(|| read_all(&reader)))) {
             Ok(_) => harmless += 1,
             Err(payload) => {
@@ -234,7 +234,7 @@ fn indices_damaged_while_processes_run_are_found_before_they_are_used() {
         }
         // a writer that starts refuses, or finds pages that could be
         quietly(|| world.refusals());
-        world.file("index").write_all_at(&right, at as u64).unwrap();
+        world.file("index").write_all_at(&right, (BODY_OFFSET + at) as u64).unwrap();
     }
     println!("{found} damaged indices found by a reader, {harmless} pointed nowhere wrong or were not in use");
     assert!(found > 100 && harmless > 100);

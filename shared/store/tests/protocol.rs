@@ -1,6 +1,6 @@
 //! The store's promises, in one process with real segments: atomic commits, stable snapshots, space, recovery.
 
-use maille_contract::{Role, control::PIN_IDLE};
+use maille_contract::{Role, control::PIN_IDLE, segment_header::BODY_OFFSET};
 use maille_store::{CommitOutcome, Reader, StoreKeeper, StoreSizes, Writer};
 use maille_transport::{ControlMap, Domain};
 use maille_volume::{BrickSource, BrickedVolume, Grid, Rescale, Volume};
@@ -287,7 +287,7 @@ fn a_damaged_or_truncated_store_is_refused_with_a_sentence() {
     assert!(error.contains("truncated"), "{error}");
     let index = std::path::Path::new("/dev/shm").join(world.domain.segment_name("index"));
     use std::os::unix::fs::FileExt;
-    std::fs::OpenOptions::new().write(true).open(&index).unwrap().write_all_at(&[1; 8], 24).unwrap();
+    std::fs::OpenOptions::new().write(true).open(&index).unwrap().write_all_at(&[1; 8], BODY_OFFSET as u64 + 24).unwrap();
     let error = Reader::open(&world.domain, Role::Haptic).err().unwrap().to_string();
     assert!(error.contains("checksum"), "{error}");
 }
@@ -302,7 +302,7 @@ fn segments_are_the_owners_alone_and_a_damaged_index_is_refused_not_followed() {
     }
     // the first root page, which names leaf pages, follows the header
     let index = std::path::Path::new("/dev/shm").join(world.domain.segment_name("index"));
-    let root = size_of::<maille_contract::index::IndexHeader>().next_multiple_of(64) as u64;
+    let root = (BODY_OFFSET + size_of::<maille_contract::index::IndexHeader>().next_multiple_of(64)) as u64;
     std::fs::OpenOptions::new().write(true).open(&index).unwrap().write_all_at(&9999u32.to_ne_bytes(), root).unwrap();
     let error = Writer::open(&world.domain).err().unwrap().to_string();
     assert!(error.contains("leaf pages") && error.contains("there is none"), "{error}");

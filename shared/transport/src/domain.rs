@@ -86,6 +86,23 @@ impl Domain {
         Ok(Self { name: name.into(), directory, lock: None })
     }
 
+    /// Removes the locks of runs that died between making their lock and giving it its name. A run does that in well under a second, so one
+    /// that is ten seconds old and held by nobody is left over. Returns how many there were.
+    pub fn remove_unfinished() -> usize {
+        let unfinished = |file: &str| {
+            let name = file.strip_prefix('.').and_then(|f| f.strip_suffix(".making"));
+            name.is_some_and(valid)
+        };
+        let entries = fs::read_dir(SHM).into_iter().flatten().flatten().filter(|entry| entry.file_name().to_str().is_some_and(unfinished));
+        let left_over = |path: &Path| {
+            let file = File::open(path).ok()?;
+            let age = file.metadata().ok()?.modified().ok()?.elapsed().ok()?;
+            let held = flock(&file, FlockOperation::NonBlockingLockShared).is_err();
+            (!held && age.as_secs() >= 10 && fs::remove_file(path).is_ok()).then_some(())
+        };
+        entries.filter_map(|entry| left_over(&entry.path())).count()
+    }
+
     /// All domains that left anything in /dev/shm, dead or alive, sorted by name.
     pub fn list() -> Vec<Self> {
         let mut names: Vec<String> = fs::read_dir(SHM)
@@ -178,6 +195,24 @@ fn count_files(directory: &Path) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_lock_of_a_run_that_died_while_making_it_is_removed_once_it_is_old_and_never_while_it_is_held() {
+        let old = std::time::SystemTime::now() - std::time::Duration::from_secs(60);
+        let make = |name: &str| {
+            let path = Path::new(SHM).join(format!(".{name}.making"));
+            (File::create(&path).unwrap(), path)
+        };
+        let digits = std::process::id() % 0x1000_0000;
+        let [(young, a), (held, b), (left, c)] = [1, 2, 3].map(|n| make(&format!("maille_{n:x}{digits:07x}")));
+        held.set_modified(old).unwrap();
+        left.set_modified(old).unwrap();
+        flock(&held, FlockOperation::NonBlockingLockExclusive).unwrap();
+        Domain::remove_unfinished();
+        assert_eq!([&a, &b, &c].map(|p| p.exists()), [true, true, false]);
+        drop((young, held));
+        [a, b].iter().for_each(|p| fs::remove_file(p).unwrap());
+    }
 
     #[test]
     fn a_domain_lives_while_its_lock_is_held_and_leaves_nothing() {

@@ -13,11 +13,11 @@ pub(crate) struct FaultMap(Memory);
 
 impl FaultMap {
     pub fn create(domain: &Domain) -> Result<Self, StoreError> {
-        Ok(Self(Segment::create(domain, SEGMENT, WORDS * size_of::<AtomicU64>())?.into()))
+        Ok(Self(Segment::create(domain, SEGMENT, WORDS as u64, WORDS * size_of::<AtomicU64>())?.into()))
     }
 
     pub fn open(domain: &Domain) -> Result<Self, StoreError> {
-        Ok(Self(Segment::open(domain, SEGMENT, Access::ReadWrite)?.into()))
+        Ok(Self(Segment::open(domain, SEGMENT, WORDS as u64, Access::ReadWrite)?.into()))
     }
 
     #[inline(always)]

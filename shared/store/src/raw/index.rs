@@ -3,11 +3,11 @@
 use super::Memory;
 use crate::{
     StoreError,
-    layout::{IndexOffsets, checked, checksum},
+    layout::{IndexOffsets, checked, index_sum},
 };
 use bytemuck::Zeroable;
 use maille_contract::index::{INDEX_MAGIC, IndexHeader, IndexLayout, LEAF_LEN, PageWord, SlotRecord};
-use maille_contract::names::segment;
+use maille_contract::{names::segment, segment_header::checksum};
 use maille_transport::{Access, Domain, Segment};
 use maille_volume::{BrickLayout, VolumeInfo};
 use std::sync::atomic::{
@@ -25,7 +25,7 @@ pub(crate) struct IndexMap {
 impl IndexMap {
     pub fn create(domain: &Domain, layout: IndexLayout) -> Result<Self, StoreError> {
         let bytes = IndexOffsets::new(&layout).total;
-        Ok(Self::make(Segment::create(domain, segment::INDEX, bytes)?.into(), layout))
+        Ok(Self::make(Segment::create(domain, segment::INDEX, index_sum(), bytes)?.into(), layout))
     }
 
     /// Writes the header into memory that is long enough and all zeros.
@@ -46,7 +46,7 @@ impl IndexMap {
     }
 
     pub fn open(domain: &Domain, access: Access) -> Result<(Self, VolumeInfo, BrickLayout), StoreError> {
-        Self::take(Segment::open(domain, segment::INDEX, access)?.into())
+        Self::take(Segment::open(domain, segment::INDEX, index_sum(), access)?.into())
     }
 
     /// Checks what somebody else made, before anything in it is used.

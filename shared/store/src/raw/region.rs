@@ -3,22 +3,30 @@
 use super::Memory;
 use crate::StoreError;
 use bytemuck::Pod;
-use maille_contract::index::RegionHeader;
+use maille_contract::{
+    index::{REGION_MAGIC, RegionHeader},
+    segment_header::layout_sum,
+};
 use maille_transport::{Access, Domain, Segment};
 use std::ops::Range;
+
+/// Checksum of the layout of any region; what is in it has a checksum of its own.
+fn region_sum() -> u64 {
+    layout_sum("region", &[REGION_MAGIC])
+}
 
 /// A mapped region. What lies where is checked by `region.rs`; here only that it lies inside.
 pub(crate) struct RegionMap(Memory);
 
 impl RegionMap {
     pub fn create(domain: &Domain, name: &str, bytes: usize) -> Result<Self, StoreError> {
-        let segment = Segment::create(domain, name, bytes.max(size_of::<RegionHeader>()))?;
+        let segment = Segment::create(domain, name, region_sum(), bytes.max(size_of::<RegionHeader>()))?;
         segment.prefault();
         Ok(Self(segment.into()))
     }
 
     pub fn open(domain: &Domain, name: &str) -> Result<Self, StoreError> {
-        Ok(Self(Segment::open(domain, name, Access::Read)?.into()))
+        Ok(Self(Segment::open(domain, name, region_sum(), Access::Read)?.into()))
     }
 
     pub fn len(&self) -> usize {

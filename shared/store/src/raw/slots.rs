@@ -1,7 +1,7 @@
 //! Slots of one channel, each a value of one plain type.
 
 use super::Memory;
-use crate::StoreError;
+use crate::{StoreError, layout::slots_sum};
 use bytemuck::Pod;
 use maille_transport::{Access, Domain, Segment};
 
@@ -15,14 +15,14 @@ pub(crate) struct Slots {
 
 impl Slots {
     pub fn create(domain: &Domain, name: &str, count: usize, stride: usize) -> Result<Self, StoreError> {
-        let segment = (count > 0).then(|| Segment::create(domain, name, count * stride)).transpose()?;
+        let segment = (count > 0).then(|| Segment::create(domain, name, slots_sum(name, count, stride), count * stride)).transpose()?;
         // mapped here too, a page that one service alone reads stays shared memory in the accounts
         segment.iter().for_each(Segment::prefault);
         Ok(Self { memory: segment.map(Memory::from), count, stride })
     }
 
     pub fn open(domain: &Domain, name: &'static str, count: usize, stride: usize, access: Access) -> Result<Self, StoreError> {
-        let segment = (count > 0).then(|| Segment::open(domain, name, access)).transpose()?;
+        let segment = (count > 0).then(|| Segment::open(domain, name, slots_sum(name, count, stride), access)).transpose()?;
         if let Some(s) = &segment {
             let expected = count.saturating_mul(stride);
             if s.len() < expected {
