@@ -1,0 +1,26 @@
+//! Volumetric implicit functions: voxels as a function on space [Shimizu & Nakamura, *Smooth surface and detailed voxel construction
+//! with volumetric implicit function for neurosurgical simulation*].
+//!
+//! Frame: index coordinates (voxel centres at integers) inside, LPS millimetres at the borders that say so. Values: HU.
+//!
+//! The octree ([`Octree`]) holds the least-squares tri-cubic of each leaf, built in one pass over the voxels of any [`BrickSource`](maille_volume::BrickSource):
+//! compact, hierarchical, and as exact as ε₀ asks for.
+//!
+//! Why not a part of `maille-surface`: that crate makes triangles and labels for eyes and files; this one is a function that
+//! touch, ray caster and marching cubes evaluate, and knows of no triangle.
+
+#![deny(unsafe_code)]
+
+mod block;
+mod chunk;
+mod evaluate;
+mod gram;
+mod leaf;
+mod merge;
+mod octree;
+mod vector;
+mod verify;
+
+pub use evaluate::Jet;
+pub use octree::{Field, NodeFit, Octree, Options, SizeTally, Tolerance, Undo, VifError};
+pub use verify::Measured;
