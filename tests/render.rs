@@ -195,3 +195,35 @@ fn wrong_numbers_are_wrong_use_status_2() {
     let output = maille(&[volume.to_str().unwrap(), "-o", out.to_str().unwrap(), same[0], same[1]]);
     assert_eq!(output.status.code(), Some(2));
 }
+
+#[test]
+fn a_mesh_of_a_surface_is_seen_where_the_surface_is_and_outlined_in_sections() {
+    let folder = Folder::new("mesh");
+    let (volume, air) = (folder.path("ball.nrrd"), folder.path("air.nrrd"));
+    write_nrrd(&volume, |x| ball(x, [5.0, 0.0, 0.0], 15.0).clamp(-1000.0, 1000.0));
+    write_nrrd(&air, |_| -1000.0);
+    let view = ["--eye=0,-200,0", "--target", "0,0,0", "--up=0,0,1", "--fov", "20", "--size", "160x120"];
+    let (_, _, surface) = picture(&volume, &folder.path("iso.png"), &[&view[..], &["--iso", "0"]].concat());
+    let silhouette = |rgb: &[u8]| rgb.chunks(3).map(|p| p.iter().any(|&v| v > 12)).collect::<Vec<_>>();
+    for ending in ["stl", "ply", "obj"] {
+        let mesh = folder.path(&format!("ball.{ending}"));
+        let args = ["surface", volume.to_str().unwrap(), "--iso", "0", "-o", mesh.to_str().unwrap()];
+        assert!(Command::new(env!("CARGO_BIN_EXE_maille")).args(args).status().unwrap().success());
+        let with = ["--mesh", mesh.to_str().unwrap()];
+        let (_, _, drawn) = picture(&air, &folder.path("mesh.png"), &[&view[..], &with].concat());
+        let (a, b) = (silhouette(&surface), silhouette(&drawn));
+        let (both, either) = a.iter().zip(&b).fold((0, 0), |(n, m), (a, b)| (n + usize::from(*a && *b), m + usize::from(*a || *b)));
+        assert!(both * 100 >= either * 97 && both > 500, "{ending}: {both} of {either}");
+        // the circle of 15 mm around (5, 0), on black, one pixel a millimetre
+        let (width, _, section) =
+            picture(&air, &folder.path("cut.png"), &[&["--view", "axial", "--at", "0", "--size", "64x64"], &with[..]].concat());
+        let lit: Vec<f64> =
+            (0..64 * 64).filter(|n| section[3 * n] > 100).map(|n| ((n % width) as f64 - 36.5).hypot((n / width) as f64 - 31.5)).collect();
+        assert!(lit.len() > 60 && lit.iter().all(|r| (r - 15.0).abs() < 1.8), "{ending}: {lit:?}");
+    }
+    let broken = folder.path("broken.stl");
+    fs::write(&broken, "solid nothing").unwrap();
+    let output = maille(&[air.to_str().unwrap(), "-o", "/dev/null", "--mesh", broken.to_str().unwrap()]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("broken.stl"));
+}

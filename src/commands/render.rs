@@ -4,10 +4,11 @@ use super::{Failure, Outcome};
 use clap::{Args as ClapArgs, ValueEnum};
 use maille_phantom::{Kind, Phantom};
 use maille_raycast::{
-    Camera, Extras, Labels, Light, Overlay, Picture, Plane, Preset, Section, Settings, Skip, SlabMode, Step, Transfer, render_extra,
-    section_with,
+    Camera, Extras, Geometry, Labels, Light, MeshView, Overlay, Picture, Plane, Preset, Section, Settings, Skip, SlabMode, Step, Transfer,
+    render_extra, section_with,
 };
 use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
+use maille_surface::{Mesh, read_mesh};
 use maille_volume::{BrickSource as _, BrickedVolume, Volume, io};
 use std::{
     fs::File,
@@ -94,6 +95,9 @@ struct More {
     /// organs on the volume's own grid, in colours: a volume of whole numbers from 0 (nothing) to 255
     #[arg(long, value_name = "VOLUME")]
     labels: Option<PathBuf>,
+    /// a mesh among the voxels, in section views its outline: .stl, .ply or .obj, LPS millimetres; may be given several times
+    #[arg(long, value_name = "MESH")]
+    mesh: Vec<PathBuf>,
     /// thickness of a section
     #[arg(long, value_name = "MM", value_parser = positive)]
     slab: Option<f64>,
@@ -145,6 +149,9 @@ pub fn run(args: &Args) -> Outcome {
     let [width, height] = args.size.or(sizes).unwrap_or([1024, 768]);
     let mut picture = Picture::new(width, height);
     let labels = args.more.labels.as_deref().map(|path| labels(path, &bricks)).transpose()?;
+    let meshes = args.more.mesh.iter().map(|path| mesh(path)).collect::<Result<Vec<_>, _>>()?;
+    let views: Vec<MeshView<'_>> = meshes.iter().zip(MESH_COLORS.into_iter().cycle()).map(|(m, color)| mesh_view(m, color)).collect();
+    let geometry = Geometry { capsules: &[], meshes: &views };
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(args.threads.unwrap_or(0))
         .build()
@@ -153,14 +160,15 @@ pub fn run(args: &Args) -> Outcome {
     let times = match plane {
         Some(plane) => {
             let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
-            let overlay = Overlay { labels: labels.as_ref(), ..Overlay::default() };
+            let overlay = Overlay { labels: labels.as_ref(), geometry: Some(&geometry), ..Overlay::default() };
             timed(frames, || pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)))
         }
         None => {
             let settings = settings(args, scene.as_ref())?;
             let camera = camera(args, scene.as_ref(), &bricks)?;
             let skip = pool.install(|| Skip::new(&bricks, &settings));
-            let extras = Extras { labels: labels.as_ref(), barrel: args.more.barrel.unwrap_or(0.0), ..Extras::default() };
+            let barrel = args.more.barrel.unwrap_or(0.0);
+            let extras = Extras { labels: labels.as_ref(), barrel, geometry: Some(&geometry), ..Extras::default() };
             let mut outcome = Ok(());
             let times =
                 timed(frames, || outcome = pool.install(|| render_extra(&extras, &bricks, &skip, &camera, &settings, &mut picture)));
@@ -253,6 +261,21 @@ fn labels(path: &Path, bricks: &BrickedVolume) -> Result<Labels, Failure> {
     };
     let voxels = volume.voxels.iter().map(label).collect::<Result<_, _>>()?;
     Labels::new(volume.info.grid.size, voxels).map_err(fault)
+}
+
+/// Colours of meshes, in turn: organs and instruments as atlases have them.
+const MESH_COLORS: [[f32; 3]; 6] =
+    [[0.85, 0.35, 0.3], [0.4, 0.65, 0.9], [0.55, 0.8, 0.45], [0.95, 0.8, 0.4], [0.75, 0.5, 0.85], [0.8, 0.8, 0.8]];
+
+fn mesh(path: &Path) -> Result<Mesh, Failure> {
+    let fault = |text: String| Failure::Refused(format!("{}: {text}", path.display()));
+    let bytes = std::fs::read(path).map_err(|e| fault(format!("cannot be read: {e}")))?;
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+    read_mesh(&bytes, ending).map_err(|e| fault(e.to_string()))
+}
+
+fn mesh_view(mesh: &Mesh, color: [f32; 3]) -> MeshView<'_> {
+    MeshView { positions: &mesh.positions, normals: &mesh.normals, triangles: &mesh.triangles, color }
 }
 
 /// A preset, or the transfer function in a file.

@@ -2,7 +2,7 @@
 
 use crate::{overlay, view::View};
 use maille_contract::{FrameHeader, Stamp, ToolState, messages::ViewRect};
-use maille_raycast::{Picture, Plane, RenderError, Section, Skip, render, section};
+use maille_raycast::{Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, render_extra, section_with};
 use maille_scene::Scene;
 use maille_volume::BrickSource;
 
@@ -20,7 +20,7 @@ impl Composer {
         let [w, h] = scene.rendering.size;
         let [sw, sh] = if scene.has_effect("sections") { scene.rendering.section_size } else { [0, 0] };
         let section = || Picture::new(sw, sh);
-        Self { skip: None, pictures: [Picture::with_depth(w, h), section(), section(), section()] }
+        Self { skip: None, pictures: [Picture::new(w, h), section(), section(), section()] }
     }
 
     /// Bytes of a frame.
@@ -40,15 +40,17 @@ impl Composer {
             empty => empty.insert(Skip::new(source, &settings)),
         };
         let [whole, sections @ ..] = &mut self.pictures;
-        render(source, skip, &camera, &settings, whole)?;
-        if let Some(tool) = tool.filter(|_| held && !at_tip) {
-            overlay::draw_tool(whole, &camera, tool);
-        }
+        let tool_body = tool.filter(|_| held).and_then(overlay::body);
+        let bodies = Geometry { capsules: tool_body.as_slice(), meshes: &[] };
+        // an endoscope does not see itself
+        let extras = Extras { geometry: Some(&bodies).filter(|_| !at_tip), ..Extras::default() };
+        render_extra(&extras, source, skip, &camera, &settings, whole)?;
         let [level, window] = view.window_hu();
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
-            section(source, &Section { level, window, ..whole }, picture);
+            let outlines = Overlay { geometry: Some(&bodies), ..Overlay::default() };
+            section_with(source, &Section { level, window, ..whole }, &outlines, picture);
         }
         Ok(())
     }

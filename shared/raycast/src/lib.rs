@@ -19,10 +19,15 @@
 pub mod budget;
 pub mod camera;
 mod frame;
+pub mod geometry;
+#[cfg(test)]
+mod geometry_tests;
 pub mod labels;
 mod lanes;
+mod outline;
 mod packet;
 pub mod picture;
+mod raster;
 pub mod render;
 mod scalar;
 pub mod section;
@@ -36,6 +41,7 @@ pub mod warp;
 
 pub use budget::{FrameBudget, Quality};
 pub use camera::Camera;
+pub use geometry::{Capsule, Geometry, MeshView, carry, vertex_normals};
 pub use labels::Labels;
 pub use picture::Picture;
 pub use render::{Extras, Kernel, RenderError, render, render_extra, render_with};
@@ -43,4 +49,4 @@ pub use section::{Overlay, Plane, Section, SlabMode, section, section_with};
 pub use settings::{Adaptive, Light, Mode, Settings, Shading, Step};
 pub use skip::{Skip, SkipUpdate};
 pub use transfer::{Preset, Transfer, TransferError};
-pub use warp::{Motion, Warp, WarpError, WarpOptions, WarpReport};
+pub use warp::{Moment, Motion, Warp, WarpError, WarpOptions, WarpReport};

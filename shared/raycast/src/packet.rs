@@ -1,7 +1,12 @@
 //! Packets of rays on the processor at hand: which [`Lanes`] run, and the entrance to the walk under their instructions.
 #![allow(unsafe_code)]
 
-use crate::{lanes::Lanes, render::Stage, scalar::Seen, walk};
+use crate::{
+    lanes::Lanes,
+    render::{Ends, Stage},
+    scalar::Seen,
+    walk,
+};
 use maille_volume::BrickSource;
 
 /// Which vectors a packet runs in.
@@ -33,6 +38,7 @@ pub fn widest() -> Width {
 pub fn cast_tile<S: BrickSource + ?Sized>(
     width: Width,
     stage: &Stage<'_, S>,
+    ends: Option<&Ends<'_>>,
     first: [usize; 2],
     size: [usize; 2],
     put: impl FnMut(usize, usize, Seen),
@@ -45,7 +51,7 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
         {
             return tile(lanes, first, size, put, |l, x, y| {
                 // SAFETY: `lanes` is the proof that this processor has the instructions.
-                unsafe { cast_avx512(l, stage, x, y) }
+                unsafe { cast_avx512(l, stage, ends, x, y) }
             });
         }
         if width == Width::Avx2
@@ -53,12 +59,12 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
         {
             return tile(lanes, first, size, put, |l, x, y| {
                 // SAFETY: `lanes` is the proof that this processor has the instructions.
-                unsafe { cast_avx2(l, stage, x, y) }
+                unsafe { cast_avx2(l, stage, ends, x, y) }
             });
         }
     }
     let _ = width;
-    tile(crate::lanes::portable::Portable, first, size, put, |l, x, y| walk::cast(l, stage, x, y));
+    tile(crate::lanes::portable::Portable, first, size, put, |l, x, y| walk::cast(l, stage, ends, x, y));
 }
 
 fn tile<L: Lanes>(
@@ -83,12 +89,24 @@ fn tile<L: Lanes>(
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn cast_avx512<S: BrickSource + ?Sized>(l: crate::lanes::avx512::Avx512, stage: &Stage<'_, S>, x: usize, y: usize) -> walk::Packet {
-    walk::cast(l, stage, x, y)
+fn cast_avx512<S: BrickSource + ?Sized>(
+    l: crate::lanes::avx512::Avx512,
+    stage: &Stage<'_, S>,
+    ends: Option<&Ends<'_>>,
+    x: usize,
+    y: usize,
+) -> walk::Packet {
+    walk::cast(l, stage, ends, x, y)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-fn cast_avx2<S: BrickSource + ?Sized>(l: crate::lanes::avx2::Avx2, stage: &Stage<'_, S>, x: usize, y: usize) -> walk::Packet {
-    walk::cast(l, stage, x, y)
+fn cast_avx2<S: BrickSource + ?Sized>(
+    l: crate::lanes::avx2::Avx2,
+    stage: &Stage<'_, S>,
+    ends: Option<&Ends<'_>>,
+    x: usize,
+    y: usize,
+) -> walk::Packet {
+    walk::cast(l, stage, ends, x, y)
 }

@@ -3,9 +3,11 @@
 use crate::{
     camera::Camera,
     frame::Frame,
+    geometry::Geometry,
     labels::Labels,
     packet::{self, Width},
     picture::Picture,
+    raster::{Band, Solids},
     scalar::{Caster, Seen},
     settings::{Light, Mode, Settings},
     skip::Skip,
@@ -74,6 +76,8 @@ pub struct Extras<'a> {
     pub warp: Option<&'a Warp>,
     /// colours of organs (volume modes)
     pub labels: Option<&'a Labels>,
+    /// solid bodies among the voxels
+    pub geometry: Option<&'a Geometry<'a>>,
     /// barrel distortion k of the lens, at least 0: the ray of a point at radius r (1 at the upper edge) looks along r·(1 + k r²)/(1 + k),
     /// so that the field of view holds at the upper edge and what is further out shrinks
     pub barrel: f64,
@@ -86,6 +90,14 @@ pub(crate) struct Stage<'a, S: ?Sized> {
     pub skip: &'a Skip,
     pub warp: Option<&'a Warp>,
     pub labels: Option<&'a Labels>,
+}
+
+/// Where rays of a band end.
+pub(crate) struct Ends<'a> {
+    /// the bodies in the band
+    pub band: &'a Band,
+    /// its first row
+    pub row: usize,
 }
 
 /// Renders a picture on the current rayon pool.
@@ -136,6 +148,8 @@ pub fn render_extra<S: BrickSource + ?Sized>(
     let frame = Frame::new(source.info(), camera, settings, [width, height], extras.barrel as f32, margin);
     let caster = Caster { frame: &frame, source, skip, jumps: extras.kernel != Kernel::ScalarWithoutSkipping };
     let stage = Stage { frame: &frame, source, skip, warp: extras.warp, labels: extras.labels };
+    let solids = extras.geometry.filter(|g| !g.is_empty());
+    let solids = solids.map(|g| Solids::new(g, camera, settings, [width, height], extras.barrel as f32, BAND));
     let lanes = match extras.kernel {
         Kernel::Fastest => Some(packet::widest()),
         Kernel::Portable => Some(Width::Portable),
@@ -145,18 +159,33 @@ pub fn render_extra<S: BrickSource + ?Sized>(
     };
     let band = |n: usize, rgb: &mut [u8], mut depth: Option<&mut [f32]>| {
         let rows = rgb.len() / (3 * width);
+        let solid = solids.as_ref().and_then(|s| s.band(n));
+        let ends = solid.as_ref().map(|band| Ends { band, row: n * BAND });
         for x0 in (0..width).step_by(TILE) {
             let columns = TILE.min(width - x0);
-            let mut put = |x: usize, y: usize, seen: Seen| {
+            let mut put = |x: usize, y: usize, mut seen: Seen| {
                 let at = (y - n * BAND) * width + x;
-                write_pixel(&frame, seen, &mut rgb[3 * at..3 * at + 3]);
+                let mut behind = frame.background;
+                if let Some(band) = &solid
+                    && band.depth[at] < f32::INFINITY
+                {
+                    behind = band.color[at];
+                    // as for the volume: where half of the light is gone
+                    seen.depth = if seen.transmittance > 0.5 { band.depth[at] } else { seen.depth };
+                }
+                write_pixel(seen, behind, &mut rgb[3 * at..3 * at + 3]);
                 if let Some(depth) = &mut depth {
                     depth[at] = seen.depth;
                 }
             };
             match lanes {
-                Some(lanes) => packet::cast_tile(lanes, &stage, [x0, n * BAND], [columns, rows], put),
-                None => (n * BAND..n * BAND + rows).for_each(|y| (x0..x0 + columns).for_each(|x| put(x, y, caster.cast(x, y)))),
+                Some(lanes) => packet::cast_tile(lanes, &stage, ends.as_ref(), [x0, n * BAND], [columns, rows], put),
+                None => (n * BAND..n * BAND + rows).for_each(|y| {
+                    (x0..x0 + columns).for_each(|x| {
+                        let end = solid.as_ref().map_or(f32::INFINITY, |band| band.depth[(y - n * BAND) * width + x]);
+                        put(x, y, caster.cast(x, y, end));
+                    });
+                }),
             }
         }
     };
@@ -179,6 +208,7 @@ fn check_extras<S: BrickSource + ?Sized>(extras: &Extras<'_>, source: &S) -> Res
     if extras.labels.is_some_and(|l| l.size() != source.info().grid.size) {
         return fault("the labels are not on the volume's grid");
     }
+    extras.geometry.map_or(Ok(()), Geometry::check)?;
     let reference = matches!(extras.kernel, Kernel::Scalar | Kernel::ScalarWithoutSkipping);
     if reference && (extras.warp.is_some() || extras.labels.is_some()) {
         return fault("the scalar kernel knows neither warp nor labels");
@@ -234,9 +264,9 @@ fn check<S: BrickSource + ?Sized>(
 }
 
 #[inline]
-fn write_pixel(frame: &Frame, seen: Seen, rgb: &mut [u8]) {
+fn write_pixel(seen: Seen, behind: [f32; 3], rgb: &mut [u8]) {
     for (c, byte) in rgb.iter_mut().enumerate() {
-        let v = seen.color[c] + seen.transmittance * frame.background[c];
+        let v = seen.color[c] + seen.transmittance * behind[c];
         *byte = (v * 255.0 + 0.5).clamp(0.0, 255.0) as u8;
     }
 }

@@ -8,6 +8,7 @@ use crate::{
     frame::{Frame, REFINEMENTS, Ray},
     settings::Mode,
     skip::{GENTLE, Skip},
+    walk::LAST_PIECE,
 };
 use maille_volume::{
     BrickSource,
@@ -35,17 +36,26 @@ pub struct Caster<'a, S: BrickSource + ?Sized> {
 }
 
 impl<S: BrickSource + ?Sized> Caster<'_, S> {
-    /// Walks the ray through a pixel.
-    pub fn cast(&self, x: usize, y: usize) -> Seen {
+    /// Walks the ray through a pixel, as far as `end` [mm] from the eye.
+    pub fn cast(&self, x: usize, y: usize, end: f32) -> Seen {
         let f = self.frame;
-        let ray = f.ray(x, y);
+        let mut ray = f.ray(x, y);
+        let ends = end < f32::INFINITY;
+        if ends {
+            ray.length = ray.length.min((end - ray.start) / f.step);
+        }
         let mut seen = Seen { color: [0.0; 3], transmittance: 1.0, depth: f32::INFINITY };
         let (mut attenuation, mut shaded) = (0.0, None);
         // the piece of ray that comes next: its beginning and length [steps]
         let (mut from, mut long) = (0.0f32, 1.0f32);
         loop {
+            let left = ray.length - from;
+            if ends {
+                long = long.min(if matches!(f.mode, Mode::Isosurface { .. }) { 2.0 * left } else { left });
+            }
             let q = from + 0.5 * long;
-            if q > ray.length || ray.length.is_nan() || ray.length <= 0.5 {
+            let short = if ends { left <= LAST_PIECE } else { ray.length <= 0.5 };
+            if q > ray.length || ray.length.is_nan() || short {
                 break;
             }
             let p = at(&ray, q);
@@ -112,7 +122,7 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
                 }
                 Mode::Isosurface { .. } => from += 1.0,
                 Mode::Xray { water_per_mm } => {
-                    attenuation += water_per_mm as f32 * f.step * (1.0 + value * 1e-3).max(0.0);
+                    attenuation += water_per_mm as f32 * f.step * long * (1.0 + value * 1e-3).max(0.0);
                     from += 1.0;
                 }
             }

@@ -5,6 +5,7 @@
 //! head up). One pixel is equally many millimetres across and down; outside the volume the picture is black.
 
 use crate::{
+    geometry::Geometry,
     labels::{Labels, hsv},
     picture::Picture,
     warp::Warp,
@@ -71,6 +72,8 @@ pub struct Overlay<'a> {
     pub labels: Option<&'a Labels>,
     /// displacement of the warp in the plane: hue is its direction, this length [mm] is opaque [Fortmeier et al. 2015, figure 10]
     pub displacement_mm: Option<f64>,
+    /// outlines of solid bodies
+    pub geometry: Option<&'a Geometry<'a>>,
 }
 
 /// A section to be drawn.
@@ -128,7 +131,7 @@ pub fn section(source: &(impl BrickSource + ?Sized), section: &Section, picture:
     section_with(source, section, &Overlay::default(), picture);
 }
 
-/// [`section`] of a moved patient and with colours; a warp or labels of another volume are left out.
+/// [`section`] of a moved patient and with colours; a warp or labels of another volume are left out, and so is a geometry with a fault.
 pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, overlay: &Overlay<'_>, picture: &mut Picture) {
     let (width, height) = (picture.width, picture.height);
     if width == 0 {
@@ -184,6 +187,9 @@ pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, ove
             }
         }
     });
+    if let Some(geometry) = overlay.geometry.filter(|g| !g.is_empty() && g.check().is_ok()) {
+        crate::outline::outlines(geometry, section, picture);
+    }
     if let Some(depth) = &mut picture.depth {
         depth.fill(f32::INFINITY);
     }

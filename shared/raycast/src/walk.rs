@@ -13,7 +13,7 @@
 use crate::{
     frame::{Frame, REFINEMENTS},
     lanes::{Float, Int, Lanes, MOST, Mask},
-    render::Stage,
+    render::{Ends, Stage},
     scalar::{Seen, ZERO_GRADIENT},
     settings::Mode,
     skip::GENTLE,
@@ -24,6 +24,8 @@ use maille_volume::{
     brick::{CELL, EDGE, ROW, SLICE, STORED, STORED_EDGE},
 };
 
+/// No piece of ray before a body is shorter [steps].
+pub(crate) const LAST_PIECE: f32 = 1e-3;
 /// Fraction bits of the weights along x.
 const WEIGHT: f32 = 16384.0;
 
@@ -116,7 +118,7 @@ fn floats<L: Lanes>(l: L, v: L::Float) -> [f32; MOST] {
 impl<L: Lanes> Rays<L> {
     /// Rays through the pixels whose first is (x, y).
     #[inline(always)]
-    fn new(l: L, frame: &Frame, x: usize, y: usize) -> Self {
+    fn new(l: L, frame: &Frame, ends: Option<&Ends<'_>>, x: usize, y: usize) -> Self {
         let column = l.load(&std::array::from_fn(|n| (x + n % L::ACROSS) as f32));
         let row = l.load(&std::array::from_fn(|n| (y + n / L::ACROSS) as f32));
         let u = column.fma(l.set(frame.scale[0]), l.set(frame.shift[0]));
@@ -137,6 +139,9 @@ impl<L: Lanes> Rays<L> {
             let b = l.set(frame.last[c] + frame.margin[c] - frame.eye[c]) / per_mm[c];
             enter = enter.max(a.min(b));
             leave = leave.min(a.max(b));
+        }
+        if let Some(ends) = ends {
+            leave = leave.min(l.load(&ends.band.depths(x, y - ends.row, L::ACROSS)));
         }
         Self {
             origin: axes!(c => enter.fma(per_mm[c], l.set(frame.eye[c]))),
@@ -184,6 +189,8 @@ struct Walker<'a, L: Lanes, S: BrickSource + ?Sized> {
     /// steps for one index step, where rays are straight
     inverse: [L::Float; 3],
     bend: Option<Bend<'a>>,
+    /// whether rays may end within the volume, at a body
+    ends: bool,
     /// number of the brick in which each lane is
     ids: L::Int,
     voxels: [*const i16; MOST],
@@ -389,8 +396,16 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
         let mut shaded = none;
         // lanes that the warp had out of the volume a moment ago
         let mut edge = none;
-        let mut alive = l.set(0.5).lt(self.rays.length);
+        let mut alive = l.set(if self.ends { 0.0 } else { 0.5 }).lt(self.rays.length);
         while alive.any() {
+            if self.ends {
+                // the last piece ends where the body begins
+                let left = self.rays.length - from;
+                alive = alive & l.set(LAST_PIECE).lt(left);
+                // a surface just before it is looked for at its very end
+                let piece = if matches!(frame.mode, Mode::Isosurface { .. }) { left + left } else { left };
+                long = long.min(piece);
+            }
             let q = long.fma(l.set(0.5), from);
             alive = alive & !self.rays.length.lt(q);
             let (mut far, mut far_out) = (none, zero);
@@ -508,7 +523,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
                 Mode::Xray { water_per_mm } => {
                     next = next.or(here, from + one);
                     let density = value.fma(l.set(1e-3), one).max(zero).only(here);
-                    attenuation = density.fma(l.set(water_per_mm as f32 * frame.step), attenuation);
+                    attenuation = (density * piece).fma(l.set(water_per_mm as f32 * frame.step), attenuation);
                 }
             }
             from = next;
@@ -602,12 +617,12 @@ impl Packet {
 
 /// Walks the rays through a packet of pixels whose first is (x, y).
 #[inline(always)]
-pub fn cast<L: Lanes, S: BrickSource + ?Sized>(l: L, stage: &Stage<'_, S>, x: usize, y: usize) -> Packet {
+pub fn cast<L: Lanes, S: BrickSource + ?Sized>(l: L, stage: &Stage<'_, S>, ends: Option<&Ends<'_>>, x: usize, y: usize) -> Packet {
     let frame = stage.frame;
     let first = stage.source.brick(0).voxels.as_ptr();
-    let rays = Rays::new(l, frame, x, y);
+    let rays = Rays::new(l, frame, ends, x, y);
     let (origin, delta) = (axes!(c => floats(l, rays.origin[c])), axes!(c => floats(l, rays.delta[c])));
     let bend = stage.warp.map(|warp| Bend::new(warp, frame.step, origin, delta, L::COUNT));
     let inverse = axes!(c => l.set(1.0) / rays.delta[c]);
-    Walker { l, stage, frame, rays, inverse, bend, ids: l.int(0), voxels: [first; MOST] }.walk()
+    Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] }.walk()
 }

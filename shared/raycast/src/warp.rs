@@ -20,5 +20,5 @@ mod field;
 mod lattice;
 
 pub(crate) use bend::Bend;
-pub use field::{Motion, WarpError};
+pub use field::{Moment, Motion, WarpError};
 pub use lattice::{Warp, WarpOptions, WarpReport};

@@ -1,4 +1,4 @@
-//! Surfaces out of volumes: marching cubes today, and files to carry the meshes away.
+//! Surfaces out of volumes: marching cubes today, and files to carry meshes away and bring them in.
 //!
 //! Frame: LPS millimetres. A surface separates voxels at or above the isovalue (inside) from those below; triangles run
 //! counter-clockwise seen from outside, and normals point outside, down the gradient.
@@ -11,9 +11,11 @@
 mod inside;
 mod marching_cubes;
 mod mesh;
+mod read;
 mod table;
 mod write;
 
 pub use marching_cubes::{Border, marching_cubes, marching_cubes_bricks, marching_cubes_with};
 pub use mesh::Mesh;
+pub use read::{ReadError, read_mesh};
 pub use write::{write_obj, write_ply, write_stl};

@@ -90,6 +90,17 @@ impl Motion {
         self.bases.len() * self.grid.voxel_count() * size_of::<[i16; 4]>()
     }
 
+    /// The motion at one moment, for points that go with the patient.
+    ///
+    /// # Errors
+    /// [`WarpError::Coefficients`] when there are not as many as basis fields.
+    pub fn moment(&self, coefficients: &[f32]) -> Result<Moment<'_>, WarpError> {
+        if coefficients.len() != self.count() {
+            return Err(WarpError::Coefficients { given: coefficients.len(), needed: self.count() });
+        }
+        Ok(Moment { field: self.lazy(coefficients), grid: &self.grid })
+    }
+
     /// Bounds under coefficients: length [mm] and contraction (max norm).
     pub(super) fn bounds(&self, coefficients: &[f32]) -> (f32, f32) {
         let sum = |of: fn(&Basis) -> f32| self.bases.iter().zip(coefficients).map(|(b, c)| of(b) * c.abs()).sum::<f32>();
@@ -214,6 +225,22 @@ fn blend_with_slopes(shape: &Shape, index: f32x4, node: impl Fn(usize) -> f32x4)
     let (g0, g1) = (mix(e[0], e[1], y), mix(e[2], e[3], y));
     let along_x = mix(mix(d[0], d[1], y), mix(d[2], d[3], y), z);
     (mix(g0, g1, z), [along_x, mix(e[1] - e[0], e[3] - e[2], z), g1 - g0])
+}
+
+/// A motion at one moment: x = X + u(X).
+pub struct Moment<'a> {
+    field: Lazy<'a>,
+    grid: &'a Grid,
+}
+
+impl Moment<'_> {
+    /// Where a point of the patient at rest is now [mm, LPS].
+    pub fn moved(&self, rest: [f64; 3]) -> [f64; 3] {
+        let index = self.grid.index_from_world(rest).map(|v| v as f32);
+        let [i, j, k, _] = self.field.value(f32x4::new([index[0], index[1], index[2], 0.0])).to_array();
+        let u = self.grid.world_from_index_matrix() * Vector3::new(f64::from(i), f64::from(j), f64::from(k));
+        std::array::from_fn(|c| rest[c] + u[c])
+    }
 }
 
 /// A motion under coefficients, summed where it is asked for.
