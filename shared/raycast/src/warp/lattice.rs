@@ -50,6 +50,9 @@ pub struct WarpReport {
 const BLOCK: usize = 4;
 /// Nodes inverted at once.
 const ROW: usize = 16;
+/// Most nodes of a lattice (64 MiB): one that would have more, since matter leaves the volume by many times its size, is coarser, and says so
+/// in its error.
+const MOST_NODES: f64 = (4 << 20) as f64;
 /// Knots are never closer [mm].
 const CLOSEST_MM: f32 = 0.5;
 
@@ -167,14 +170,14 @@ impl Warp {
         }
         // a quarter more, so that a breath that grows does not start anew each frame
         self.margin = needed.map(|m| (1.25 * m).ceil());
-        self.pitch = std::array::from_fn(|c| self.options.pitch_mm / self.spacing[c]);
+        let lengths: [f32; 3] = std::array::from_fn(|c| (self.size[c] - 1) as f32 + 2.0 * self.margin[c]);
+        let nodes: f64 = (0..3).map(|c| f64::from(lengths[c] * self.spacing[c] / self.options.pitch_mm) + 2.0).product();
+        let coarser = (nodes / MOST_NODES).cbrt().max(1.0) as f32;
+        self.pitch = std::array::from_fn(|c| coarser * self.options.pitch_mm / self.spacing[c]);
         self.per_pitch = self.pitch.map(|p| 1.0 / p);
         self.turn_scale = std::array::from_fn(|d| std::array::from_fn(|c| self.spacing[c] / (self.pitch[d] * self.spacing[d])));
         self.origin = self.margin.map(|m| -m);
-        self.counts = std::array::from_fn(|c| {
-            let length = (self.size[c] - 1) as f32 + 2.0 * self.margin[c];
-            ((length / self.pitch[c]).ceil() as usize + 1).max(2)
-        });
+        self.counts = std::array::from_fn(|c| ((lengths[c] / self.pitch[c]).ceil() as usize + 1).max(2));
         self.blocks = self.counts.map(|n| n.div_ceil(BLOCK));
         self.nodes = vec![f32x4::ZERO; self.counts.iter().product()];
         self.reach = vec![CLOSEST_MM; self.blocks.iter().product()];
