@@ -1,0 +1,27 @@
+//! What happened to the tip in a tick.
+
+/// What happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EventKind {
+    /// the tip met the skin, a layer or a tissue that does not give way at once
+    Contact,
+    /// the tip cut into a tissue: through the skin, a capsule, a wall, or from one tissue into the next
+    Puncture,
+    /// the needle left the patient
+    Withdrawn,
+}
+
+/// Something that happened to the tip, for the report.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Event {
+    /// what
+    pub kind: EventKind,
+    /// tissue that was met (index into the table)
+    pub material: u8,
+    /// where, in reference space [mm]
+    pub reference_mm: [f64; 3],
+    /// path cut so far, in reference space [mm]
+    pub depth_mm: f64,
+    /// force at the tip just before [N]
+    pub force_n: f64,
+}

@@ -1,0 +1,278 @@
+//! The path that the tip has cut: nodes in reference space, placed as the tip goes forward, taken back as it goes back.
+//!
+//! No node: the needle is outside. One: the tip rests on the skin. More: p_1 on the skin, then a node every Δp, and the tip p_l, the only one that
+//! moves [Fortmeier et al. 2015, section 2.3]:
+//!
+//!   p_l⁺ = p_l + d_l·{ Δd (back, towards p_{l−1}) if Δd ≤ 0;  0 while a₂Δd² + a₁Δd < f_cut (eq. 4);
+//!                      Δd + γ₁ − √(γ₁² + γ₂) if a₂ > 0;  Δd − f_cut/a₁ if a₂ = 0 }
+//!
+//! where the last two leave exactly the deflection at which the spring holds f_cut. Nearer to p_{l−1} than 0.5·Δp that node goes; further than
+//! 1.5·Δp a node is placed Δp behind it. A tip that moves far in one tick looks at the tissue on its way, so that no layer is missed. A layer at
+//! the entry of a tissue ([`crate::Capsule`]) holds the tip at the border until its own force is reached. Where the next tissue is stiffer, its spring
+//! begins at the force that the last one held ([`Path::preload_mm`]): a border does not store energy.
+//!
+//! Units: mm, N; frame: reference. Invariants: neighbours are never nearer than 0.5·Δp or further than 1.5·Δp, but for a first piece that is
+//! shorter; capacity is fixed. Cost: at most [`MAX_LOOKS`] look-ups a tick, one where the needle moves slowly. Allocation: none after `new`.
+
+use crate::events::{Event, EventKind};
+use crate::limits::{MAX_EVENTS, MAX_LOOKS};
+use crate::{MaterialTable, Tissue, V3};
+
+/// Step of looks ahead [mm].
+const LOOK_MM: f64 = 0.5;
+
+/// A place that the tip has passed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PathNode {
+    /// p_i [mm]
+    pub reference: V3,
+    /// tissue there
+    pub material: u8,
+    /// Δx_i [mm], eq. 6
+    pub slip_mm: f64,
+}
+
+/// Events of a tick, in order.
+pub(crate) type Told = [Option<Event>; MAX_EVENTS];
+
+/// Puts an event behind the others; one too many is left out.
+pub(crate) fn tell(told: &mut Told, event: Event) {
+    if let Some(free) = told.iter_mut().find(|e| e.is_none()) {
+        *free = Some(event);
+    }
+}
+
+/// The nodes, and what the tip is about to cut.
+#[derive(Clone, Debug)]
+pub struct Path {
+    nodes: Vec<PathNode>,
+    spacing_mm: f64,
+    /// layer that holds the tip now: force, and what is left of it [N, mm]
+    layer: Option<(f64, f64)>,
+    /// part of Δd that the present tissue's spring does not see [mm]
+    preload_mm: f64,
+}
+
+impl Path {
+    /// An empty path with nodes every `spacing_mm` and room for a needle of `length_mm`.
+    pub(crate) fn new(spacing_mm: f64, length_mm: f64) -> Self {
+        // neighbours may be half a spacing apart; breathing may stretch a path by half
+        let room = ((3.0 * length_mm / spacing_mm) as usize + 8).min(crate::limits::MAX_PATH_NODES);
+        Self { nodes: Vec::with_capacity(room), spacing_mm, layer: None, preload_mm: 0.0 }
+    }
+
+    /// Nodes from the skin to the tip.
+    pub fn nodes(&self) -> &[PathNode] {
+        &self.nodes
+    }
+
+    pub(crate) fn nodes_mut(&mut self) -> &mut [PathNode] {
+        &mut self.nodes
+    }
+
+    /// Most nodes it can hold.
+    pub(crate) fn capacity(&self) -> usize {
+        self.nodes.capacity()
+    }
+
+    /// The tip, if inside.
+    pub fn tip(&self) -> Option<&PathNode> {
+        self.nodes.last()
+    }
+
+    /// Δp [mm].
+    pub fn spacing_mm(&self) -> f64 {
+        self.spacing_mm
+    }
+
+    /// Δd that the tip's spring does not see [mm].
+    pub fn preload_mm(&self) -> f64 {
+        self.preload_mm
+    }
+
+    /// Length in reference space [mm].
+    pub fn length_mm(&self) -> f64 {
+        self.nodes.windows(2).map(|w| (w[1].reference - w[0].reference).norm()).sum()
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.nodes.clear();
+        self.layer = None;
+        self.preload_mm = 0.0;
+    }
+
+    /// First contact with the skin.
+    pub(crate) fn touch(&mut self, reference: V3, material: u8, table: &MaterialTable) {
+        self.clear();
+        self.nodes.push(PathNode { reference, material, slip_mm: 0.0 });
+        self.enter(material, table);
+    }
+
+    /// Force at which the tip goes on [N].
+    pub fn threshold_n(&self, table: &MaterialTable) -> f64 {
+        match (self.layer, self.nodes.last()) {
+            (Some((force, _)), _) => force,
+            (None, Some(tip)) => table.get(tip.material).cutting_force_n,
+            (None, None) => 0.0,
+        }
+    }
+
+    /// Force of the tip's spring at a deflection [N]; eq. 5 without sign and direction.
+    pub fn tip_force_n(&self, deflection_mm: f64, table: &MaterialTable) -> f64 {
+        self.nodes.last().map_or(0.0, |tip| table.get(tip.material).tip_force_n(deflection_mm - self.preload_mm))
+    }
+
+    fn enter(&mut self, material: u8, table: &MaterialTable) {
+        self.layer = table.get(material).capsule.map(|c| (c.cutting_force_n, c.thickness_mm));
+    }
+
+    /// Moves the tip for a device that is Δd ahead along d (unit vector); returns how far it went [mm], negative for back.
+    pub(crate) fn follow<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
+        if self.nodes.is_empty() || !delta_mm.is_finite() || delta_mm == 0.0 {
+            return 0.0;
+        }
+        if delta_mm < 0.0 { -self.retract(-delta_mm, tissue, told) } else { self.cut(delta_mm, d, tissue, table, told) }
+    }
+
+    fn cut<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
+        // a device that came back gives the spring its whole length again
+        self.preload_mm = self.preload_mm.min(delta_mm);
+        let look = LOOK_MM.max(delta_mm / (MAX_LOOKS / 2) as f64);
+        let (mut left, mut went) = (delta_mm, 0.0);
+        for _ in 0..MAX_LOOKS {
+            let l = self.nodes.len() - 1;
+            let tip = self.nodes[l];
+            let material = table.get(tip.material);
+            let spring = left - self.preload_mm;
+            let force = material.tip_force_n(spring);
+            let threshold = self.threshold_n(table);
+            if force < threshold {
+                break;
+            }
+            let told_here = |depth: f64, at: V3| Event {
+                kind: EventKind::Puncture,
+                material: tip.material,
+                reference_mm: at.into(),
+                depth_mm: depth,
+                force_n: force,
+            };
+            if self.layer.is_some_and(|(_, thickness)| thickness <= 0.0) {
+                self.layer = None;
+                tell(told, told_here(self.length_mm(), tip.reference));
+                continue;
+            }
+            let within = self.layer.map_or(f64::INFINITY, |(_, thickness)| thickness);
+            let step = (spring - material.deflection_mm(threshold)).min(look).min(within);
+            if step <= 1e-9 {
+                break;
+            }
+            let (to, found) = beyond(tip.reference, d * step, tip.material, tissue);
+            let stepped = (to - tip.reference).norm();
+            if l == 0 {
+                // p_1 stays on the skin
+                self.nodes.push(tip);
+            }
+            let l = self.nodes.len() - 1;
+            self.nodes[l].reference = to;
+            (left, went) = (left - stepped, went + stepped);
+            self.preload_mm = (self.preload_mm - stepped).max(0.0);
+            if let Some((_, thickness)) = &mut self.layer {
+                *thickness -= stepped;
+            }
+            if found != tip.material {
+                self.nodes[l].material = found;
+                self.enter(found, table);
+                let stands = self.layer.is_some() || table.get(found).cutting_force_n == f64::INFINITY;
+                let kind = if stands { EventKind::Contact } else { EventKind::Puncture };
+                tell(told, Event { kind, material: found, ..told_here(self.length_mm(), to) });
+                // same force on the other side of the border
+                let spring = left - self.preload_mm;
+                self.preload_mm = (left - table.get(found).deflection_mm(material.tip_force_n(spring))).clamp(0.0, left);
+            } else if within == step {
+                self.layer = None;
+                tell(told, told_here(self.length_mm(), to));
+            }
+            self.place_nodes();
+        }
+        went
+    }
+
+    /// The rule of 1.5·Δp, and the node on the skin when the tip leaves it.
+    fn place_nodes(&mut self) {
+        let l = self.nodes.len() - 1;
+        let tip = self.nodes[l];
+        if l == 0 {
+            return;
+        }
+        let behind = self.nodes[l - 1].reference;
+        let along = tip.reference - behind;
+        let length = along.norm();
+        if length > 1.5 * self.spacing_mm && self.nodes.len() < self.nodes.capacity() {
+            let at = behind + along * (self.spacing_mm / length);
+            self.nodes[l].reference = at;
+            // it lies in what the tip has passed: the tissue of the tip but for one step
+            self.nodes.push(tip);
+        }
+    }
+
+    fn retract<T: Tissue + ?Sized>(&mut self, by_mm: f64, tissue: &T, told: &mut Told) -> f64 {
+        (self.preload_mm, self.layer) = (0.0, None);
+        let mut left = by_mm;
+        // each round takes a node away or ends
+        while left > 0.0 {
+            let l = self.nodes.len() - 1;
+            let tip = self.nodes[l];
+            if l == 0 {
+                tell(
+                    told,
+                    Event {
+                        kind: EventKind::Withdrawn,
+                        material: tip.material,
+                        reference_mm: tip.reference.into(),
+                        depth_mm: 0.0,
+                        force_n: 0.0,
+                    },
+                );
+                self.clear();
+                return by_mm;
+            }
+            let back = self.nodes[l - 1].reference - tip.reference;
+            let length = back.norm();
+            if left >= length {
+                left -= length;
+                self.nodes.pop();
+                continue;
+            }
+            self.nodes[l].reference = tip.reference + back * (left / length);
+            if length - left < 0.5 * self.spacing_mm && l >= 2 {
+                self.nodes.remove(l - 1);
+            }
+            break;
+        }
+        let l = self.nodes.len() - 1;
+        // p_1 keeps what was found at the contact: it lies on the border
+        if l > 0 {
+            self.nodes[l].material = tissue.material_at(self.nodes[l].reference.into());
+        }
+        by_mm
+    }
+}
+
+/// A step through tissue, or as far as just over the first border; and what is there.
+fn beyond<T: Tissue + ?Sized>(from: V3, step: V3, material: u8, tissue: &T) -> (V3, u8) {
+    let found = tissue.material_at((from + step).into());
+    if found == material {
+        return (from + step, found);
+    }
+    let (mut low, mut high, mut there) = (0.0, 1.0, found);
+    for _ in 0..12 {
+        let middle = 0.5 * (low + high);
+        let here = tissue.material_at((from + step * middle).into());
+        if here == material {
+            low = middle;
+        } else {
+            (high, there) = (middle, here);
+        }
+    }
+    (from + step * high, there)
+}

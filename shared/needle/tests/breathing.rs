@@ -1,0 +1,128 @@
+//! The needle in a patient who breathes.
+
+#![allow(clippy::disallowed_macros, clippy::disallowed_methods, reason = "tests and examples print what they found and take the time")]
+
+mod common;
+
+use common::{Breath, DT, LENGTH, half_space, needle, straight, tick};
+use maille_needle::{Breathing, HandlePose, Inputs, Material, NeedleTool, V3};
+
+/// A needle put in while the patient breathes.
+fn inserted(breath: Breath, depth: f64) -> (NeedleTool, f64) {
+    let mut tool = needle(Material::LIVER_TRAINING);
+    let seconds = depth / 10.0;
+    let mut t = 0.0;
+    while t < seconds {
+        tick(&mut tool, straight(10.0 * t), &breath.at(t), &half_space);
+        t += DT;
+    }
+    (tool, t)
+}
+
+#[test]
+fn the_tip_of_a_needle_let_go_stays_where_it_is_in_the_tissue() {
+    for depth in [20.0, 60.0, 110.0] {
+        let breath = Breath::new(12.0);
+        let (mut tool, start) = inserted(breath, depth);
+        let tick_free = |tool: &mut NeedleTool, t: f64| {
+            let breathing = breath.at(t);
+            let out = tool.tick(&Inputs { dt_s: DT, handle: straight(0.0), held: false, breathing: &breathing, tissue: &half_space });
+            let tip = breathing.to_reference(out.tip_mm, out.tip_reference_mm);
+            (out, V3::from(tip))
+        };
+        // a breath of 4 s to come to its balance, one as reference, then 15: each tick beside the same moment of the reference breath
+        for n in 0..4000 {
+            tick_free(&mut tool, start + f64::from(n) * DT);
+        }
+        let (mut drift, mut within, mut path_drift, mut travel, mut residual): (f64, f64, f64, f64, f64) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let path_tip = tool.path().tip().unwrap().reference;
+        let reference: Vec<V3> = (4000..8000).map(|n| tick_free(&mut tool, start + f64::from(n) * DT).1).collect();
+        let at_start = V3::from(tick_free(&mut tool, start + 8.0).0.handle.position_mm);
+        for n in 8001..68_000 {
+            let (out, tip) = tick_free(&mut tool, start + f64::from(n) * DT);
+            drift = drift.max((tip - reference[n as usize % 4000]).norm());
+            within = within.max((tip - reference[0]).norm());
+            path_drift = path_drift.max((V3::from(out.tip_reference_mm) - path_tip).norm());
+            travel = travel.max((V3::from(out.handle.position_mm) - at_start).norm());
+            residual = residual.max(out.solved.residual_mm);
+            assert_eq!(out.force_n, [0.0; 3]);
+        }
+        println!(
+            "{depth} mm deep, 60 s free: needle's tip drifts {drift:.1e} mm in tissue (and springs by {within:.3} mm within a breath), path's {path_drift:.1e}; handle travels {travel:.1} mm"
+        );
+        assert!(drift < 0.05 && path_drift == 0.0 && residual <= 1e-5, "{drift} {path_drift} {residual}");
+        // the handle is moved by the breath
+        assert!(travel > 1.5, "{travel}");
+    }
+}
+
+#[test]
+fn tissue_that_moves_sideways_tilts_the_needle_about_the_skin() {
+    // deep tissue to +x, the skin at rest: outside, the needle goes the other way
+    struct Shear(f64);
+    impl Breathing for Shear {
+        fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
+            [self.0 * (x[2] / 80.0).clamp(0.0, 1.0), 0.0, 0.0]
+        }
+    }
+    let mut tool = needle(Material { stiffness_n_per_mm: 2.0, ..Material::LIVER_TRAINING });
+    for n in 0..8000 {
+        tick(&mut tool, straight(f64::from(n) * 0.01), &Shear(0.0), &half_space);
+    }
+    let free = |tool: &mut NeedleTool, by: f64| {
+        tool.tick(&Inputs { dt_s: DT, handle: straight(0.0), held: false, breathing: &Shear(by), tissue: &half_space })
+    };
+    for n in 0..1000 {
+        free(&mut tool, 8.0 * f64::from(n) / 1000.0);
+    }
+    let out = free(&mut tool, 8.0);
+    let base = out.handle.position_mm;
+    println!("tip moved to x = {:.2} mm, handle to {:.2} mm", out.tip_mm[0], base[0]);
+    assert!(out.tip_mm[0] > 6.0 && base[0] < -4.0, "{base:?} {:?}", out.tip_mm);
+    // a straight lever would stand at −8·70/80
+    assert!((base[0] + 7.0).abs() < 1.5);
+}
+
+#[test]
+fn a_held_handle_feels_the_lever_of_moving_tissue() {
+    let breath = Breath { full_mm: 60.0, ..Breath::new(10.0) };
+    let (mut tool, start) = inserted(breath, 70.0);
+    let mut most: f64 = 0.0;
+    for n in 0..8000 {
+        let out = tick(&mut tool, straight(70.0), &breath.at(start + f64::from(n) * DT), &half_space);
+        most = most.max(out.base_n);
+        // a torque, but never about the axis
+        assert!(out.torque_n_mm[2].abs() < 1e-9);
+    }
+    println!("lateral force of a held handle over two breaths: up to {most:.3} N");
+    assert!(most > 0.02);
+}
+
+#[test]
+fn a_path_cut_in_moving_tissue_is_curved_in_reference_space_though_the_needle_is_nearly_straight() {
+    // as in figure 8, lower: tissue moves sideways while the needle goes in
+    struct Sway(f64);
+    impl Breathing for Sway {
+        fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
+            let share = (x[2] / 60.0).clamp(0.0, 1.0);
+            [self.0 * share * share, 0.0, 0.0]
+        }
+    }
+    let mut tool = needle(Material::LIVER_TRAINING);
+    for n in 0..8000 {
+        let t = f64::from(n) * DT;
+        tick(&mut tool, straight(10.0 * t), &Sway(6.0 * (0.8 * t).sin()), &half_space);
+    }
+    let path = tool.path().nodes();
+    let bend = path.iter().map(|p| p.reference.x).fold((f64::MAX, f64::MIN), |(l, h), x| (l.min(x), h.max(x)));
+    let off_line = tool.nodes().iter().map(|x| x.x.abs()).fold(0.0, f64::max);
+    println!("path spans {:.2} mm sideways in reference space; the needle lies within {off_line:.2} mm of its line", bend.1 - bend.0);
+    assert!(bend.1 - bend.0 > 2.0 && off_line < 0.7 * (bend.1 - bend.0));
+    let _ = LENGTH;
+}
+
+#[test]
+fn a_handle_pose_that_points_nowhere_is_refused() {
+    assert!(HandlePose::pointing([0.0; 3], [0.0; 3], 100.0).is_none());
+    assert!(HandlePose::pointing([0.0; 3], [f64::NAN; 3], 100.0).is_none());
+}
