@@ -5,7 +5,10 @@
 //!
 //! - haptic: what the process itself recorded during the block, taken from the control block.
 //! - bare: a thread of this program that sleeps to an absolute time and does nothing else, half a period away from the haptic ticks so that
-//!   neither waits for the other. The run goes on beside it, haptic included: that is its load.
+//!   neither waits for the other.
+//!
+//! Both loops go on in both kinds of block, so that each side has the other beside it and both have the same load: a core that a timer wakes
+//! twice a period sleeps less deeply than one that it wakes once. Which of the two is looked at turns from block to block.
 //!
 //! Both use the same clock, sleep and histogram (buckets of 3 %). The interval of p99.9 is that of order statistics, which counts ticks as
 //! independent; delays come in bursts, so the range over blocks is printed as well. It judges nothing: on a machine that does other
@@ -67,12 +70,12 @@ impl Block {
     }
 }
 
-/// What the haptic process records within a time.
-fn haptic(control: &ControlMap, time: Duration) -> Block {
+/// What the haptic process records while a bare loop runs beside it.
+fn haptic(control: &ControlMap, scene: &Scene, time: Duration) -> Block {
     let cell = control.service(Role::Haptic);
     let look = || (cell.lateness.counts(), cell.counter(Counter::Overruns));
     let (before, missed_before) = look();
-    std::thread::sleep(time);
+    bare(control, scene, time);
     let (after, missed) = look();
     Block { counts: after.iter().zip(before).map(|(a, b)| a - b).collect(), missed: missed - missed_before }
 }
@@ -140,7 +143,7 @@ fn main() {
         let time = Duration::from_secs_f64(seconds);
         for side in [pair % 2, 1 - pair % 2] {
             match side {
-                0 => loops.push(haptic(&control, time)),
+                0 => loops.push(haptic(&control, &resolved, time)),
                 _ => bares.push(bare(&control, &resolved, time)),
             }
         }
