@@ -1,0 +1,167 @@
+//! A governor on a made machine: the load is the product of what is given up and what else runs there.
+
+use super::*;
+
+const DT_S: f64 = 0.1;
+
+fn points(times: &[(f64, f64, f64)]) -> Vec<FrontPoint> {
+    times.iter().map(|&(value, time, error)| FrontPoint { value, time, error }).collect()
+}
+
+fn ladder() -> Ladder {
+    let step = points(&[(0.5, 2.0, 0.1), (1.0, 1.0, 0.2), (1.5, 0.7, 0.4), (2.0, 0.55, 0.8), (3.0, 0.4, 9.0)]);
+    let end = points(&[(0.999, 1.05, 0.001), (0.99, 1.0, 0.01), (0.95, 0.9, 0.05)]);
+    let sampling = points(&[(3.0, 1.5, 0.01), (1.0, 1.0, 0.2)]);
+    Ladder::new()
+        .then("rendering.step", Loop::Rendering, 1.0, 1.0, &step)
+        .then("rendering.opacity_end", Loop::Rendering, 0.99, 0.1, &end)
+        .then("deformation.sampling_order", Loop::Deformation, 3.0, 1.0, &sampling)
+}
+
+/// A machine on which full quality makes these loads.
+struct Machine {
+    governor: Governor,
+    time_s: f64,
+    turns: Vec<(f64, Turn)>,
+}
+
+impl Machine {
+    fn new() -> Self {
+        Self { governor: Governor::new(ladder()), time_s: 0.0, turns: Vec::new() }
+    }
+
+    fn load(&self, of: Loop, full: f64) -> f64 {
+        self.governor.given_up().filter(|r| r.of == of).fold(full, |load, r| load * r.saves)
+    }
+
+    fn run(&mut self, seconds: f64, rendering: f64, deformation: f64) {
+        for _ in 0..(seconds / DT_S) as usize {
+            let loads =
+                [(Loop::Rendering, self.load(Loop::Rendering, rendering)), (Loop::Deformation, self.load(Loop::Deformation, deformation))];
+            self.time_s += DT_S;
+            if let Some(turn) = self.governor.observe(&loads, DT_S) {
+                self.turns.push((self.time_s, turn));
+            }
+        }
+    }
+}
+
+#[test]
+fn rungs_lie_on_the_front_below_where_one_starts_and_within_the_error_allowed() {
+    let ladder = ladder();
+    let steps: Vec<(f64, f64)> = ladder.rungs().iter().filter(|r| r.knob == "rendering.step").map(|r| (r.finer, r.coarser)).collect();
+    assert_eq!(steps, [(1.0, 1.5), (1.5, 2.0)], "not above the start, not beyond the error");
+    assert!(ladder.rungs().iter().all(|r| r.saves > 0.0 && r.saves < 1.0));
+    // a point that another beats is no rung, nor one that is no number
+    let mut bad = points(&[(1.0, 1.0, 0.2), (1.2, 0.9, 0.5), (1.5, 0.7, 0.4), (1.7, f64::NAN, 0.4), (1.8, 0.5, f64::NAN)]);
+    bad.push(FrontPoint { value: f64::NAN, time: 0.1, error: 0.0 });
+    let ladder = Ladder::new().then("k", Loop::Rendering, 1.0, 1.0, &bad);
+    assert_eq!(ladder.rungs().iter().map(|r| r.coarser).collect::<Vec<_>>(), [1.5]);
+}
+
+#[test]
+fn a_machine_that_holds_its_deadlines_is_left_alone() {
+    let mut machine = Machine::new();
+    machine.run(60.0, 0.99, 0.5);
+    assert_eq!(machine.turns, []);
+}
+
+#[test]
+fn pressure_takes_rungs_in_the_declared_order_one_at_a_time_and_they_come_back_in_reverse_within_five_seconds() {
+    let mut machine = Machine::new();
+    machine.run(10.0, 0.8, 0.3);
+    assert!(machine.turns.is_empty());
+    machine.run(20.0, 1.9, 0.3);
+    let down: Vec<f64> = machine.turns.iter().map(|(_, t)| t.value).collect();
+    assert_eq!(down, [1.5, 2.0, 0.95], "{:?}", machine.turns);
+    assert!(machine.turns.windows(2).all(|w| w[1].0 - w[0].0 >= SETTLE_S), "one at a time: {:?}", machine.turns);
+    assert!(machine.load(Loop::Rendering, 1.9) < 1.0);
+    let (over_s, before) = (machine.time_s, machine.turns.len());
+    machine.run(5.0, 0.8, 0.3);
+    let up: Vec<f64> = machine.turns[before..].iter().map(|(_, t)| t.value).collect();
+    assert_eq!(up, [0.99, 1.5, 1.0], "what was given up last comes back first");
+    assert!(machine.turns.last().is_some_and(|(at, _)| at - over_s <= 5.0));
+    assert_eq!(machine.governor.given_up().count(), 0);
+}
+
+#[test]
+fn loops_are_relieved_by_their_own_knobs_only() {
+    let mut machine = Machine::new();
+    machine.run(10.0, 0.5, 1.4);
+    assert_eq!(machine.turns.iter().map(|(_, t)| (t.knob.as_str(), t.value)).collect::<Vec<_>>(), [("deformation.sampling_order", 1.0)]);
+    assert_eq!(machine.governor.setting("deformation.sampling_order"), Some(1.0));
+    assert_eq!(machine.governor.setting("rendering.step"), None);
+}
+
+#[test]
+fn a_loop_that_nothing_can_save_ends_at_the_last_rung_and_stays() {
+    let mut machine = Machine::new();
+    machine.run(60.0, 50.0, 0.1);
+    assert_eq!(machine.turns.len(), 3);
+}
+
+/// The load with a rung taken lies below what lets it come back, by what was measured, and the machine does not agree: without hysteresis it
+/// would turn for ever.
+#[test]
+fn a_front_that_is_wrong_on_this_machine_makes_turns_rarer_and_rarer() {
+    let mut governor = Governor::new(ladder());
+    let mut turns = Vec::new();
+    for n in 0..6000 {
+        let load = if governor.given_up().count() == 0 { 1.1 } else { 0.4 };
+        if governor.observe(&[(Loop::Rendering, load)], DT_S).is_some() {
+            turns.push(f64::from(n) * DT_S);
+        }
+    }
+    let in_time = |from: f64, to: f64| turns.iter().filter(|t| (from..to).contains(*t)).count();
+    assert!(in_time(0.0, 60.0) > 2 * in_time(540.0, 600.0) && in_time(540.0, 600.0) <= 8, "{turns:?}");
+}
+
+#[test]
+fn loads_that_flicker_about_one_turn_nothing() {
+    let mut governor = Governor::new(ladder());
+    let turned = (0..1000).any(|n| governor.observe(&[(Loop::Rendering, if n % 3 == 0 { 0.9 } else { 1.3 })], DT_S).is_some());
+    assert!(!turned, "it was never pressed for long");
+}
+
+#[test]
+fn loads_and_times_that_are_no_numbers_say_nothing() {
+    let mut governor = Governor::new(ladder());
+    for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0] {
+        for _ in 0..50 {
+            assert_eq!(governor.observe(&[(Loop::Rendering, bad)], DT_S), None);
+            assert_eq!(governor.observe(&[(Loop::Rendering, 2.0)], if bad == -1.0 { bad } else { f64::NAN }), None);
+        }
+    }
+    assert_eq!(governor.turns(), 0);
+    assert_eq!(Governor::new(Ladder::new()).observe(&[(Loop::Rendering, 9.0)], 10.0), None, "an empty ladder turns nothing");
+}
+
+#[test]
+fn any_sequence_of_loads_keeps_every_setting_on_its_ladder() {
+    let mut seed = 1u64;
+    let mut random = move || {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (seed >> 40) as f64 / f64::from(1u32 << 24)
+    };
+    let mut governor = Governor::new(ladder());
+    let mut current =
+        std::collections::BTreeMap::from([("rendering.step", 1.0), ("rendering.opacity_end", 0.99), ("deformation.sampling_order", 3.0)]);
+    let mut loads = [(Loop::Rendering, 0.0), (Loop::Deformation, 0.0)];
+    for n in 0..50_000 {
+        if n % 20 == 0 {
+            loads = [(Loop::Rendering, 2.5 * random()), (Loop::Deformation, 2.5 * random())];
+        }
+        if let Some(turn) = governor.observe(&loads, 0.5 * random()) {
+            let rung = governor
+                .ladder()
+                .rungs()
+                .iter()
+                .find(|r| r.knob == turn.knob && if turn.coarser { r.coarser == turn.value } else { r.finer == turn.value });
+            let rung = rung.unwrap_or_else(|| panic!("{turn:?} is no rung")).clone();
+            let setting = current.get_mut(rung.knob.as_str()).expect("a knob of the ladder");
+            assert_eq!(*setting, if turn.coarser { rung.finer } else { rung.coarser }, "a rung was skipped");
+            *setting = turn.value;
+        }
+    }
+    assert!(governor.turns() > 1000);
+}
