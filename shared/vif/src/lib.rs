@@ -11,16 +11,26 @@
 
 #![deny(unsafe_code)]
 
+mod bicubic;
 mod block;
 mod chunk;
 mod evaluate;
+mod function;
 mod gram;
+mod lattice;
 mod leaf;
 mod merge;
 mod octree;
+mod patch;
+mod spline;
 mod vector;
 mod verify;
 
+pub use bicubic::Bicubic;
 pub use evaluate::Jet;
+pub use function::{Function, Interpolated};
+pub use lattice::{Lattice, Voxels};
 pub use octree::{Field, NodeFit, Octree, Options, SizeTally, Tolerance, Undo, VifError};
+pub use patch::{LocalSurface, NoSurface, paper_surface};
+pub use spline::{Spline, Window};
 pub use verify::Measured;
