@@ -1,5 +1,9 @@
 //! One bit a voxel: inside or outside. 64 voxels are compared, skipped or counted at once.
 
+use maille_volume::{
+    BrickSource,
+    brick::{Brick, EDGE},
+};
 use rayon::prelude::*;
 
 /// Inside bits, row by row; a row starts on a word, bits past its end are 0.
@@ -26,6 +30,43 @@ impl Inside {
         Self { size, words, bits }
     }
 
+    /// The same out of bricks: those whose skip cells lie on one side of the threshold are not read.
+    pub fn of_bricks(source: &impl BrickSource, threshold: i32, below: bool) -> Self {
+        let layout = source.layout();
+        let size = layout.size;
+        let words = size[0].div_ceil(64);
+        let mut bits = vec![0u64; words * size[1] * size[2]];
+        bits.par_chunks_mut(words * size[1] * EDGE).enumerate().for_each(|(bk, slab)| {
+            let slices = slab.len() / (words * size[1]);
+            for bj in 0..layout.counts[1] {
+                let rows = EDGE.min(size[1] - bj * EDGE);
+                for bi in 0..layout.counts[0] {
+                    let brick = source.brick(layout.id([bi, bj, bk]));
+                    let [low, high] = brick.range().map(i32::from);
+                    let all = low >= threshold;
+                    let (first, count) = (bi * EDGE, EDGE.min(size[0] - bi * EDGE));
+                    if (!all && high < threshold && !below) || (all && below) {
+                        continue;
+                    }
+                    let mixed = !all && high >= threshold;
+                    for k in 0..slices {
+                        for j in 0..rows {
+                            let row = &mut slab[(k * size[1] + bj * EDGE + j) * words..][..words];
+                            let voxels = &brick.voxels[Brick::offset(0, j as isize, k as isize)..][..count];
+                            for (n, part) in voxels.chunks(64).enumerate() {
+                                let valid = u64::MAX >> (64 - part.len());
+                                let flip = if below { u64::MAX } else { 0 };
+                                let word = if mixed { (compare(part, threshold) ^ flip) & valid } else { valid };
+                                set(row, first + 64 * n, word);
+                            }
+                        }
+                    }
+                }
+            }
+        });
+        Self { size, words, bits }
+    }
+
     /// The words of a row.
     #[inline]
     pub fn row(&self, j: usize, k: usize) -> &[u64] {
@@ -43,6 +84,17 @@ impl Inside {
     pub fn cells(&self, word: usize) -> u64 {
         let left = self.size[0] - 1 - (word * 64).min(self.size[0] - 1);
         if left >= 64 { u64::MAX } else { (1 << left) - 1 }
+    }
+}
+
+/// Sets the bits of `word` in a row from place `first` on.
+#[inline]
+fn set(row: &mut [u64], first: usize, word: u64) {
+    let (at, shift) = (first / 64, first % 64);
+    row[at] |= word << shift;
+    // what runs over into the next word; never for bricks whose edge divides 64
+    if shift > 0 && word >> (64 - shift) != 0 {
+        row[at + 1] |= word >> (64 - shift);
     }
 }
 

@@ -21,7 +21,10 @@ use crate::{
     mesh::Mesh,
     table,
 };
-use maille_volume::{BrickSource, Volume};
+use maille_volume::{
+    BrickSource, Volume, VolumeInfo,
+    brick::{Brick, EDGE, ROW, SLICE},
+};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
@@ -43,9 +46,38 @@ pub fn marching_cubes(volume: &Volume, iso: f64) -> Mesh {
     marching_cubes_with(volume, iso, Border::Open)
 }
 
-/// The isosurface of a volume in bricks; the voxels are copied into a flat volume first.
+/// The isosurface of a volume in bricks, read where they lie; bricks that the surface does not pass cost a look at their skip cells.
+/// For a closed border the voxels are copied into a flat volume first.
 pub fn marching_cubes_bricks(source: &impl BrickSource, iso: f64, border: Border) -> Mesh {
-    marching_cubes_with(&source.to_volume(), iso, border)
+    if border == Border::Closed {
+        return marching_cubes_with(&source.to_volume(), iso, border);
+    }
+    let Some(Level { level, threshold, below }) = Level::new(source.info(), iso) else { return Mesh::default() };
+    let size = source.layout().size;
+    if size.iter().any(|&n| n < 2) {
+        return Mesh::default();
+    }
+    let inside = Inside::of_bricks(source, threshold, below);
+    Extraction { size, voxels: Bricks(source), inside, level, padded: false, place: Place::new(source.info(), 0.0) }.run()
+}
+
+/// An isovalue in stored numbers.
+struct Level {
+    level: f32,
+    /// smallest stored number inside, or outside if `below`
+    threshold: i32,
+    below: bool,
+}
+
+impl Level {
+    /// `None` for an isovalue that is not finite.
+    fn new(info: &VolumeInfo, iso: f64) -> Option<Self> {
+        let level = info.rescale.stored(iso);
+        // with a falling rescale the bright side is that of small stored numbers
+        let below = info.rescale.slope < 0.0;
+        let threshold = if below { level.floor() + 1.0 } else { level.ceil() }.clamp(-40_000.0, 40_000.0) as i32;
+        level.is_finite().then_some(Self { level: level as f32, threshold, below })
+    }
 }
 
 /// The isosurface `iso` (HU) of a volume. Empty for an isovalue that is not finite.
@@ -53,14 +85,7 @@ pub fn marching_cubes_bricks(source: &impl BrickSource, iso: f64, border: Border
 /// # Panics
 /// When the mesh would have 2³² vertices or more.
 pub fn marching_cubes_with(volume: &Volume, iso: f64, border: Border) -> Mesh {
-    let rescale = volume.info.rescale;
-    let level = rescale.stored(iso);
-    if !level.is_finite() {
-        return Mesh::default();
-    }
-    // with a falling rescale the bright side is that of small stored numbers
-    let below = rescale.slope < 0.0;
-    let threshold = if below { level.floor() + 1.0 } else { level.ceil() }.clamp(-40_000.0, 40_000.0) as i32;
+    let Some(Level { level, threshold, below }) = Level::new(&volume.info, iso) else { return Mesh::default() };
     let size = volume.info.grid.size;
     let flat = |size: [usize; 3], voxels: &[i16], shift, padded| {
         if size.iter().any(|&n| n < 2) {
@@ -69,7 +94,7 @@ pub fn marching_cubes_with(volume: &Volume, iso: f64, border: Border) -> Mesh {
         // the layer around a padded volume is outside whatever the isovalue
         let threshold = if padded { threshold.clamp(-32_767, 32_767) } else { threshold };
         let inside = Inside::new(size, voxels, threshold, below);
-        Extraction { size, voxels, inside, level: level as f32, padded, place: Place::new(volume, shift) }.run()
+        Extraction { size, voxels: Flat { size, voxels }, inside, level, padded, place: Place::new(&volume.info, shift) }.run()
     };
     match border {
         Border::Open => flat(size, &volume.voxels, 0.0, false),
@@ -103,18 +128,75 @@ struct Place {
 }
 
 impl Place {
-    fn new(volume: &Volume, shift: f64) -> Self {
-        let grid = &volume.info.grid;
+    fn new(info: &VolumeInfo, shift: f64) -> Self {
+        let grid = &info.grid;
         let matrix = grid.world_from_index_matrix();
         let origin = Vector3::from(grid.origin) - matrix * Vector3::repeat(shift);
-        let normal = -volume.info.rescale.slope.signum() * grid.index_from_world_matrix().transpose();
+        let normal = -info.rescale.slope.signum() * grid.index_from_world_matrix().transpose();
         Self { matrix, origin, normal, mirrored: matrix.determinant() < 0.0 }
     }
 }
 
-struct Extraction<'a> {
+/// Where voxels are fetched at the few places that the surface passes.
+trait Fetch: Sync {
+    /// What is around the lattice edge from `at` along `axis`.
+    fn edge(&self, at: [usize; 3], axis: usize) -> impl Ends;
+}
+
+/// Voxels around a lattice edge.
+trait Ends {
+    /// The voxel at the edge's start (or its end), or `step` (−1, 0, 1) from it along an axis; not asked for beyond the border.
+    fn voxel(&self, end: bool, axis: usize, step: isize) -> f32;
+}
+
+/// A flat volume.
+struct Flat<'a> {
     size: [usize; 3],
     voxels: &'a [i16],
+}
+
+/// A volume in bricks.
+struct Bricks<'a, S>(&'a S);
+
+/// Voxels in one array with strides; both kinds of volume come to this.
+struct Strided<'a> {
+    voxels: &'a [i16],
+    here: usize,
+    along: usize,
+    step: [usize; 3],
+}
+
+impl Ends for Strided<'_> {
+    #[inline(always)]
+    fn voxel(&self, end: bool, axis: usize, step: isize) -> f32 {
+        let here = if end { self.here + self.along } else { self.here };
+        f32::from(self.voxels[here.wrapping_add_signed(step * self.step[axis] as isize)])
+    }
+}
+
+impl Fetch for Flat<'_> {
+    #[inline(always)]
+    fn edge(&self, at: [usize; 3], axis: usize) -> impl Ends {
+        let [nx, ny, _] = self.size;
+        let step = [1, nx, nx * ny];
+        Strided { voxels: self.voxels, here: (at[2] * ny + at[1]) * nx + at[0], along: step[axis], step }
+    }
+}
+
+impl<S: BrickSource> Fetch for Bricks<'_, S> {
+    #[inline(always)]
+    fn edge(&self, at: [usize; 3], axis: usize) -> impl Ends {
+        // the apron holds the neighbours of both ends
+        let brick = self.0.brick(self.0.layout().brick_of(at[0], at[1], at[2]));
+        let [i, j, k] = at.map(|v| (v % EDGE) as isize);
+        let step = [1, ROW, SLICE];
+        Strided { voxels: &brick.voxels, here: Brick::offset(i, j, k), along: step[axis], step }
+    }
+}
+
+struct Extraction<F> {
+    size: [usize; 3],
+    voxels: F,
     inside: Inside,
     level: f32,
     padded: bool,
@@ -136,7 +218,7 @@ struct Out<'o> {
     normals: std::slice::IterMut<'o, [f32; 3]>,
 }
 
-impl Extraction<'_> {
+impl<F: Fetch> Extraction<F> {
     fn run(&self) -> Mesh {
         let [_, _, nz] = self.size;
         // first pass: the number of the first vertex of every slice
@@ -274,12 +356,10 @@ impl Extraction<'_> {
     /// Makes the vertex on the lattice edge that goes from voxel `at` along `axis`.
     #[inline]
     fn vertex(&self, at: [usize; 3], axis: usize, out: &mut Out) {
-        let [nx, ny, _] = self.size;
-        let step = [1, nx, nx * ny];
-        let here = (at[2] * ny + at[1]) * nx + at[0];
         let mut end = at;
         end[axis] += 1;
-        let [a, b] = [here, here + step[axis]].map(|n| f32::from(self.voxels[n]));
+        let ends = self.voxels.edge(at, axis);
+        let [a, b] = [false, true].map(|e| ends.voxel(e, axis, 0));
         let mut t = (self.level - a) / (b - a);
         let mut gradient: Vector3<f64>;
         if self.padded && (at[axis] == 0 || end[axis] == self.size[axis] - 1) {
@@ -288,7 +368,7 @@ impl Extraction<'_> {
             gradient = Vector3::zeros();
             gradient[axis] = f64::from(b - a);
         } else {
-            let [low, high] = [self.gradient(at, here), self.gradient(end, here + step[axis])];
+            let [low, high] = [self.gradient(at, &ends, false), self.gradient(end, &ends, true)];
             gradient = Vector3::from_fn(|c, _| f64::from(low[c] + t * (high[c] - low[c])));
             if gradient == Vector3::zeros() {
                 gradient[axis] = f64::from(b - a);
@@ -304,15 +384,12 @@ impl Extraction<'_> {
 
     /// Central differences at a voxel, by index; one-sided at the border, and beside padding.
     #[inline]
-    fn gradient(&self, at: [usize; 3], here: usize) -> [f32; 3] {
-        let [nx, ny, _] = self.size;
-        let step = [1, nx, nx * ny];
+    fn gradient(&self, at: [usize; 3], ends: &impl Ends, end: bool) -> [f32; 3] {
         let edge = usize::from(self.padded);
         std::array::from_fn(|c| {
-            let low = if at[c] > edge { here - step[c] } else { here };
-            let high = if at[c] + 1 + edge < self.size[c] { here + step[c] } else { here };
-            let difference = f32::from(self.voxels[high]) - f32::from(self.voxels[low]);
-            if high - low == 2 * step[c] { 0.5 * difference } else { difference }
+            let (low, high) = (-isize::from(at[c] > edge), isize::from(at[c] + 1 + edge < self.size[c]));
+            let difference = ends.voxel(end, c, high) - ends.voxel(end, c, low);
+            if high - low == 2 { 0.5 * difference } else { difference }
         })
     }
 

@@ -232,3 +232,21 @@ fn bricks_and_thread_counts_change_nothing() {
     assert_eq!(one, run(7));
     assert_eq!(one, marching_cubes_bricks(&BrickedVolume::from_volume(&volume), 0.5, Border::Open));
 }
+
+#[test]
+fn bricks_give_the_flat_volumes_mesh_with_empty_ones_and_a_falling_scale() {
+    let mut ball = ball([70, 51, 45], [1.0, 1.1, 1.4], 14.0);
+    for slope in [0.01, -0.01] {
+        ball.info.rescale.slope = slope;
+        for iso in [0.0, -30.0, 90.0] {
+            for border in [Border::Open, Border::Closed] {
+                let mesh = marching_cubes_with(&ball, iso, border);
+                assert!(!mesh.triangles.is_empty());
+                assert_eq!(mesh, marching_cubes_bricks(&BrickedVolume::from_volume(&ball), iso, border), "{slope} {iso} {border:?}");
+            }
+        }
+    }
+    let mut noise = noise([70, 21, 18], 5);
+    noise.info.rescale = Rescale { slope: -2.0, intercept: 7.0 };
+    assert_eq!(marching_cubes(&noise, 8.0), marching_cubes_bricks(&BrickedVolume::from_volume(&noise), 8.0, Border::Open));
+}
