@@ -8,14 +8,18 @@
 
 #![forbid(unsafe_code)]
 
+mod gltf;
 mod inside;
 mod marching_cubes;
 mod mesh;
 mod read;
 mod table;
+mod vif;
 mod write;
 
+pub use gltf::write_glb;
 pub use marching_cubes::{Border, marching_cubes, marching_cubes_bricks, marching_cubes_with};
 pub use mesh::Mesh;
 pub use read::{ReadError, read_mesh};
+pub use vif::{ResolutionError, marching_cubes_vif};
 pub use write::{write_obj, write_ply, write_stl};

@@ -150,11 +150,12 @@ impl Octree {
         jet
     }
 
-    /// Values (stored units) at the voxels of the block that begins at `first`, i fastest; past the border nothing is meant.
-    pub(crate) fn block_values(&self, first: [usize; 3], out: &mut [f32; VOXELS]) {
+    /// Values (stored units) at the voxels of the block that begins at `first`, i fastest; past the extent that comes back nothing is meant.
+    pub(crate) fn block_values(&self, first: [usize; 3], out: &mut [f32; VOXELS]) -> [usize; 3] {
         let leaf = self.leaf_at(first);
+        let size = self.info().grid.size;
+        let extent: [usize; 3] = std::array::from_fn(|c| (size[c] - first[c]).min(BLOCK));
         if leaf.kind.is_raw() {
-            let extent: [usize; 3] = std::array::from_fn(|c| self.axes[c].basis(0, leaf.at[c]).n);
             let mut n = 0;
             for k in 0..extent[2] {
                 for j in 0..extent[1] {
@@ -169,6 +170,7 @@ impl Octree {
             let local = self.local(&leaf, first.map(|v| v as f64));
             expand(mean, &c, local.map(|l| l.0), local.map(|l| l.1), out);
         }
+        extent
     }
 
     /// The function at every voxel, rounded to the volume's stored numbers.

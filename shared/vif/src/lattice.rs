@@ -8,7 +8,7 @@ use crate::{
 };
 use maille_volume::{
     BrickSource, VolumeInfo,
-    brick::{Brick, EDGE},
+    brick::{Brick, CELL, CELLS_EDGE, EDGE},
 };
 
 /// Somewhere lattice values can be read.
@@ -17,6 +17,9 @@ pub trait Lattice: Sync {
     fn info(&self) -> &VolumeInfo;
     /// Writes the box `low .. low + extent`, which lies in the volume: value (i, j, k) of the box at k·slice + j·row + i.
     fn read(&self, low: [usize; 3], extent: [usize; 3], row: usize, slice: usize, out: &mut [f32]);
+    /// Two numbers between which all values of the box `low .. low + extent` lie, which lies in the volume; cheaper than the values, and
+    /// not always the closest two.
+    fn range(&self, low: [usize; 3], extent: [usize; 3]) -> [f32; 2];
     /// Writes the box `first .. first + extent`, i fastest, clamped to the volume.
     ///
     /// # Panics
@@ -62,6 +65,24 @@ impl<S: BrickSource + ?Sized> Lattice for Voxels<'_, S> {
     fn info(&self) -> &VolumeInfo {
         self.0.info()
     }
+    fn range(&self, low: [usize; 3], extent: [usize; 3]) -> [f32; 2] {
+        let layout = self.0.layout();
+        let mut range = [i16::MAX, i16::MIN];
+        // skip cells that show a voxel of the box
+        let cells: [std::ops::RangeInclusive<usize>; 3] = std::array::from_fn(|c| low[c] / CELL..=(low[c] + extent[c] - 1) / CELL);
+        for k in cells[2].clone() {
+            for j in cells[1].clone() {
+                for i in cells[0].clone() {
+                    let at = [i, j, k];
+                    let brick = self.0.brick(layout.id(at.map(|v| v / CELLS_EDGE)));
+                    let [i, j, k] = at.map(|v| v % CELLS_EDGE);
+                    let [a, b] = brick.cells[(k * CELLS_EDGE + j) * CELLS_EDGE + i];
+                    range = [range[0].min(a), range[1].max(b)];
+                }
+            }
+        }
+        range.map(f32::from)
+    }
     #[inline]
     fn read(&self, low: [usize; 3], extent: [usize; 3], row: usize, slice: usize, out: &mut [f32]) {
         let layout = self.0.layout();
@@ -90,6 +111,25 @@ impl<S: BrickSource + ?Sized> Lattice for Voxels<'_, S> {
 }
 
 impl Lattice for Octree {
+    fn range(&self, low: [usize; 3], extent: [usize; 3]) -> [f32; 2] {
+        let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
+        let mut values = [0f32; VOXELS];
+        let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+        for bk in low[2] / BLOCK..=(end[2] - 1) / BLOCK {
+            for bj in low[1] / BLOCK..=(end[1] - 1) / BLOCK {
+                for bi in low[0] / BLOCK..=(end[0] - 1) / BLOCK {
+                    let extent = self.block_values([bi * BLOCK, bj * BLOCK, bk * BLOCK], &mut values);
+                    for row in 0..BLOCK * BLOCK {
+                        if row % BLOCK < extent[1] && row / BLOCK < extent[2] {
+                            let row = &values[row * BLOCK..][..extent[0]];
+                            range = row.iter().fold(range, |r, &v| [r[0].min(v), r[1].max(v)]);
+                        }
+                    }
+                }
+            }
+        }
+        range
+    }
     fn info(&self) -> &VolumeInfo {
         Octree::info(self)
     }
