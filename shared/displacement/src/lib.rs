@@ -18,7 +18,7 @@ mod trilinear;
 
 pub use axes::{along_axes, in_patient};
 pub use invert::{Inverse, Inverter, Scheme};
-pub use row::RowField;
+pub use row::{RowField, RowOutcome};
 pub use trilinear::trilinear;
 
 /// Displacement and its derivative at one rest position, in index units.

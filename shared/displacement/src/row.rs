@@ -27,6 +27,15 @@ const ROW_ITERATIONS: u32 = 16;
 /// Newton needs two or three; a point that takes more wants damping.
 const ROW_NEWTON: u32 = 6;
 
+/// What a row's inversion did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RowOutcome {
+    /// field evaluations
+    pub evaluations: u32,
+    /// bit n: point n did not converge
+    pub open: u64,
+}
+
 impl Inverter {
     /// Inverts the points `range` of a row, in place from their starts. `converged` tells which met the rule. Returns the number of
     /// field evaluations.
@@ -39,9 +48,29 @@ impl Inverter {
         position: &mut [f32x4; N],
         converged: &mut [bool; N],
     ) -> u32 {
+        let starts = *position;
+        let outcome = self.invert_row_from(field, |n| target[n], range.clone(), |n| starts[n], position);
+        for n in range {
+            converged[n] = outcome.open >> n & 1 == 0;
+        }
+        outcome.evaluations
+    }
+
+    /// Inverts the points `range` of a row with targets `target(n)` from `start(n)`, into `position`.
+    #[inline(always)]
+    pub fn invert_row_from<const N: usize>(
+        &self,
+        field: &impl RowField,
+        target: impl Fn(usize) -> f32x4,
+        range: Range<usize>,
+        start: impl Fn(usize) -> f32x4,
+        position: &mut [f32x4; N],
+    ) -> RowOutcome {
+        const { assert!(N <= 64, "open points are bits of a word") };
+        assert!(range.start <= range.end && range.end <= N, "the range lies in the row");
         match self.scheme {
-            Scheme::FixedPoint => self.fixed_point_row(field, target, range, position, converged),
-            Scheme::Newton => self.newton_row(field, target, range, position, converged),
+            Scheme::FixedPoint => self.fixed_point_row(field, target, range, start, position),
+            Scheme::Newton => self.newton_row(field, target, range, start, position),
         }
     }
 
@@ -49,18 +78,18 @@ impl Inverter {
     fn fixed_point_row<const N: usize>(
         &self,
         field: &impl RowField,
-        target: &[f32x4; N],
+        target: impl Fn(usize) -> f32x4,
         range: Range<usize>,
+        start: impl Fn(usize) -> f32x4,
         position: &mut [f32x4; N],
-        converged: &mut [bool; N],
-    ) -> u32 {
-        const { assert!(N <= 64, "open points are bits of a word") };
+    ) -> RowOutcome {
         let (stop, weight) = (f32x4::splat(self.stop() / self.contraction), weights(self.weight));
         let mut evaluations = range.len() as u32;
         let mut open = 0u64;
         // every point once, independent of one another
-        for n in range.clone() {
-            open |= u64::from(approach(field, &mut position[n], target[n], weight, stop)) << n;
+        for n in range {
+            position[n] = start(n);
+            open |= u64::from(approach(field, &mut position[n], target(n), weight, stop)) << n;
         }
         // then only those that go on
         for _ in 1..ROW_ITERATIONS {
@@ -70,58 +99,55 @@ impl Inverter {
             evaluations += open.count_ones();
             let mut left = open;
             while left != 0 {
-                let n = left.trailing_zeros() as usize;
+                let n = left.trailing_zeros() as usize % N;
                 left &= left - 1;
-                if !approach(field, &mut position[n], target[n], weight, stop) {
+                if !approach(field, &mut position[n], target(n), weight, stop) {
                     open &= !(1 << n);
                 }
             }
         }
-        for n in range {
-            converged[n] = open >> n & 1 == 0;
-        }
-        evaluations
+        RowOutcome { evaluations, open }
     }
 
     #[inline(always)]
     fn newton_row<const N: usize>(
         &self,
         field: &impl RowField,
-        target: &[f32x4; N],
+        target: impl Fn(usize) -> f32x4,
         range: Range<usize>,
+        start: impl Fn(usize) -> f32x4,
         position: &mut [f32x4; N],
-        converged: &mut [bool; N],
-    ) -> u32 {
+    ) -> RowOutcome {
         let stop = self.stop();
         let weight = weights(self.weight);
         let mut evaluations = 0;
-        for n in range.clone() {
-            converged[n] = false;
+        let mut open = 0u64;
+        for n in range {
+            position[n] = start(n);
+            open |= 1 << n;
         }
         for iteration in 0..ROW_NEWTON {
-            let mut open = false;
-            for n in range.clone() {
-                if converged[n] {
-                    continue;
-                }
+            evaluations += open.count_ones();
+            let mut left = open;
+            while left != 0 {
+                let n = left.trailing_zeros() as usize % N;
+                left &= left - 1;
                 let (u, slopes) = field.jet(position[n]);
-                let r = target[n] - position[n] - u;
-                evaluations += 1;
+                let r = target(n) - position[n] - u;
                 if largest(r.abs() * weight) <= stop {
-                    converged[n] = true;
+                    open &= !(1 << n);
                     continue;
                 }
-                open = true;
                 // the last test has no step after it, so that what is returned is what was tested
                 if iteration + 1 < ROW_NEWTON {
                     position[n] += step(u, &slopes, r);
                 }
             }
-            if !open {
+            if open == 0 {
                 break;
             }
         }
-        evaluations
+        RowOutcome { evaluations, open }
     }
 }
 

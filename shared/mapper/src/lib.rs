@@ -273,7 +273,7 @@ pub fn tissue_rest_position<S: BrickSource + ?Sized>(rest: &S, mail: &ChainMail,
     let low = index.map(|v| v as usize);
     let range = Box3 { low, high: std::array::from_fn(|c| (low[c] + 1).min(grid.size[c] - 1)) };
     let (mut window, mut pieces, mut open) = (Window::new(), Pieces::default(), OpenVoxels::new());
-    window.gather(mail, reach::preimage_box_beside_gaps(mail, range, &mail.loaded_bricks()));
+    window.gather(vector::Plain, mail, reach::preimage_box_beside_gaps(mail, range, &mail.loaded_bricks()));
     pieces.gather(rest, mail, &window);
     let target = std::array::from_fn(|c| (index[c] - window.low()[c] as f64) as f32);
     open.add(Open::new([0; 3], target, target));
@@ -293,7 +293,7 @@ pub fn rest_position(mail: &ChainMail, grid: &Grid, world_mm: [f64; 3]) -> Optio
     let low = index.map(|v| v as usize);
     let range = Box3 { low, high: std::array::from_fn(|c| (low[c] + 1).min(grid.size[c] - 1)) };
     let mut window = Window::new();
-    window.gather(mail, reach::preimage_box(mail, range));
+    window.gather(vector::Plain, mail, reach::preimage_box(mail, range));
     // relative to the window, so that f32 loses nothing far from the grid's first voxel
     let target = std::array::from_fn(|c| (index[c] - window.low()[c] as f64) as f32);
     let inverter = Inverter::for_offset(mail.tissue().offset, 1e-3).on_spacing(mail.spacing());

@@ -5,7 +5,10 @@
 //! corners; where displacements are small the spans of the changed elements are dilated by their range instead, a brick at a
 //! time. Covering too much costs time, never correctness; the union is the same whoever collects it in whatever order.
 
-use crate::window::Window;
+use crate::{
+    vector::{Task, Width, widest},
+    window::Window,
+};
 use maille_chainmail::{ChainMail, ChangedBrick};
 use maille_volume::{BrickId, BrickLayout, brick::EDGE};
 use wide::f32x4;
@@ -37,8 +40,8 @@ const BIAS: f32 = 2048.0;
 
 /// Largest dilation of spans [voxels].
 const REACH: usize = 4;
-/// Rows of a brick and of its neighbours within reach.
-const WIDE: usize = EDGE + 2 * REACH;
+/// Rows of a brick and of its neighbours.
+const WIDE: usize = 3 * EDGE;
 
 /// No entry.
 const NONE: u32 = u32::MAX;
@@ -106,6 +109,11 @@ impl Cover {
     /// The same beside voids and cuts, where the map is not one-to-one: what the changed elements held when they were mapped last is left,
     /// so that their displacements of then, `seen` [mm] brick by brick, count as well.
     pub fn add_beside_gaps(&mut self, mail: &ChainMail, changed: &ChangedBrick, seen: &[Range]) {
+        widest(AddBesideGaps { to: self, mail, changed, seen });
+    }
+
+    #[inline(always)]
+    fn add_beside_gaps_now(&mut self, mail: &ChainMail, changed: &ChangedBrick, seen: &[Range]) {
         let layout = *mail.layout();
         let Some((low, high)) = bounds(&changed.spans) else { return };
         let first = layout.first_voxel(changed.id);
@@ -123,6 +131,11 @@ impl Cover {
 
     /// Adds the voxels that the changed elements of one brick may have given a new pre-image.
     pub fn add(&mut self, mail: &ChainMail, changed: &ChangedBrick, window: &mut Window) {
+        widest(Add { to: self, mail, changed, window });
+    }
+
+    #[inline(always)]
+    fn add_now<W: Width>(&mut self, width: W, mail: &ChainMail, changed: &ChangedBrick, window: &mut Window) {
         let layout = *mail.layout();
         let Some((low, high)) = bounds(&changed.spans) else { return };
         let (first, last) = (layout.first_voxel(changed.id), layout.size.map(|s| s - 1));
@@ -131,6 +144,7 @@ impl Cover {
         }
         // elements low − 1 … high + 1 are corners of the touched cells low − 1 … high
         window.gather(
+            width,
             mail,
             Box3 {
                 low: std::array::from_fn(|c| (first[c] + low[c]).saturating_sub(1)),
@@ -168,6 +182,7 @@ impl Cover {
     }
 
     /// Adds the spans of a changed brick, dilated on both sides of each axis by no more than [`REACH`].
+    #[inline(always)]
     fn add_dilated(
         &mut self,
         layout: &BrickLayout,
@@ -185,7 +200,8 @@ impl Cover {
             for j in low[1]..=high[1] {
                 let [a, b] = changed.spans[k * EDGE + j];
                 if b > 0 {
-                    (rows[0][j + 2 * REACH], rows[1][j + 2 * REACH]) = (i16::from(a) + by[0][0] as i16, i16::from(b) + by[0][1] as i16);
+                    (rows[0][j + EDGE + REACH], rows[1][j + EDGE + REACH]) =
+                        (i16::from(a) + by[0][0] as i16, i16::from(b) + by[0][1] as i16);
                 }
             }
             for shift in by[1][0]..=by[1][1] {
@@ -195,11 +211,18 @@ impl Cover {
                 union(plane, [ends(0), ends(1)]);
             }
         }
-        let ends = |c: usize| low[c] as isize + by[c][0]..=high[c] as isize + by[c][1];
+        // the neighbours within reach, and what of the volume lies around the brick
+        let size = layout.size;
+        let steps = |c: usize| {
+            let below = low[c] as isize + by[c][0] < 0 && first[c] > 0;
+            let above = high[c] as isize + by[c][1] >= EDGE as isize && first[c] + EDGE < size[c];
+            usize::from(!below)..2 + usize::from(above)
+        };
+        let volume = [0, size[0]].map(|at| (at as isize - first[0] as isize).clamp(-(EDGE as isize), 2 * EDGE as isize) as i16);
         let mut places = [usize::MAX; 27];
-        for z in ends(2) {
+        for z in low[2] as isize + by[2][0]..=high[2] as isize + by[2][1] {
             let voxel_k = first[2] as isize + z;
-            if voxel_k < 0 || voxel_k >= layout.size[2] as isize {
+            if voxel_k < 0 || voxel_k >= size[2] as isize {
                 continue;
             }
             let mut rows = EMPTY;
@@ -207,25 +230,22 @@ impl Cover {
                 let [a, b] = &in_plane[k as usize];
                 union(&mut rows, [a, b]);
             }
-            for y in ends(1) {
-                let (voxel_j, at) = (first[1] as isize + y, (y + REACH as isize) as usize);
-                let a = (first[0] as isize + rows[0][at] as isize).max(0);
-                let b = (first[0] as isize + rows[1][at] as isize).min(layout.size[0] as isize);
-                if rows[0][at] == i16::MAX || voxel_j < 0 || voxel_j >= layout.size[1] as isize || a >= b {
-                    continue;
-                }
-                let (a, b, j, k) = (a as usize, b as usize, voxel_j as usize, voxel_k as usize);
-                for brick in a / EDGE..=(b - 1) / EDGE {
-                    let at = [brick, j / EDGE, k / EDGE];
-                    // spans reach no further than the neighbours
-                    let step = |c: usize| at[c] + 1 - first[c] / EDGE;
-                    let near = &mut places[(step(2) * 3 + step(1)) * 3 + step(0)];
-                    if *near == usize::MAX {
-                        *near = self.place_mut(layout.id(at));
+            let k = voxel_k as usize;
+            for step_j in steps(1) {
+                let lanes = |side: usize| rows[side][step_j * EDGE..].first_chunk::<EDGE>().expect("three bricks wide");
+                let (from, to) = (lanes(0), lanes(1));
+                // rows beyond the volume's border are none
+                let count = (size[1] - (first[1] + step_j * EDGE - EDGE)).min(EDGE);
+                for step_i in steps(0) {
+                    let part = Part::new(from, to, count, volume, step_i as i16 * EDGE as i16 - EDGE as i16);
+                    if part.is_empty() {
+                        continue;
                     }
-                    let place = *near;
-                    let (from, to) = (a.max(brick * EDGE) - brick * EDGE, b.min(brick * EDGE + EDGE) - brick * EDGE);
-                    extend(&mut self.spans[place][k % EDGE * EDGE + j % EDGE], [from as u8, to as u8]);
+                    let near = &mut places[((k / EDGE + 1 - first[2] / EDGE) * 3 + step_j) * 3 + step_i];
+                    if *near == usize::MAX {
+                        *near = self.place_mut(layout.id([first[0] / EDGE + step_i - 1, first[1] / EDGE + step_j - 1, k / EDGE]));
+                    }
+                    part.add_to(self.spans[*near][k % EDGE * EDGE..].first_chunk_mut().expect("the rows of a plane"));
                 }
             }
         }
@@ -294,6 +314,45 @@ fn dilation(u: Range) -> Option<[[isize; 2]; 3]> {
     u.iter().flatten().all(|&v| near(v)).then(|| u.map(|[l, h]| [(l - SLACK).ceil() as isize - 1, (h + SLACK).floor() as isize + 1]))
 }
 
+/// Spans of the rows of one plane of a brick, by lanes; empty ones: first EDGE or more, end 0.
+struct Part {
+    first: [u16; EDGE],
+    end: [u16; EDGE],
+}
+
+impl Part {
+    /// What of `count` rows lies in the volume and in the brick that begins at `zero`.
+    #[inline(always)]
+    fn new(from: &[i16; EDGE], to: &[i16; EDGE], count: usize, volume: [i16; 2], zero: i16) -> Self {
+        let mut out = Self { first: [0; EDGE], end: [0; EDGE] };
+        for j in 0..EDGE {
+            let a = (from[j].max(volume[0]).min(volume[1]) - zero).max(0).min(EDGE as i16);
+            let b = (to[j].max(volume[0]).min(volume[1]) - zero).max(0).min(EDGE as i16);
+            let there = if a < b { u16::MAX } else { 0 } & if (j as u16) < count as u16 { u16::MAX } else { 0 };
+            out.first[j] = a as u16 | !there;
+            out.end[j] = b as u16 & there;
+        }
+        out
+    }
+
+    #[inline(always)]
+    fn is_empty(&self) -> bool {
+        self.end.iter().fold(0, |any, e| any | e) == 0
+    }
+
+    /// Union with what is there.
+    #[inline(always)]
+    fn add_to(&self, spans: &mut [[u8; 2]; EDGE]) {
+        for (j, span) in spans.iter_mut().enumerate() {
+            let old = u16::from_le_bytes(*span);
+            let (first, end) = (old & 0xff, old >> 8);
+            let first = first | if end == 0 { u16::MAX } else { 0 };
+            let (first, end) = (first.min(self.first[j]), end.max(self.end[j]));
+            *span = (if end == 0 { 0 } else { first | end << 8 }).to_le_bytes();
+        }
+    }
+}
+
 /// Union of spans, row by row.
 #[inline(always)]
 fn union(to: &mut [[i16; WIDE]; 2], from: [&[i16; WIDE]; 2]) {
@@ -326,7 +385,51 @@ fn extend(span: &mut [u8; 2], [low, high]: [u8; 2]) {
     *span = if span[1] == 0 { [low, high] } else { [span[0].min(low), span[1].max(high)] };
 }
 
+/// [`Cover::add`] with the widest vectors.
+struct Add<'a> {
+    to: &'a mut Cover,
+    mail: &'a ChainMail,
+    changed: &'a ChangedBrick,
+    window: &'a mut Window,
+}
+
+impl Task for Add<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<W: Width>(self, width: W) {
+        self.to.add_now(width, self.mail, self.changed, self.window);
+    }
+}
+
+/// [`Cover::add_beside_gaps`] with the widest vectors.
+struct AddBesideGaps<'a> {
+    to: &'a mut Cover,
+    mail: &'a ChainMail,
+    changed: &'a ChangedBrick,
+    seen: &'a [Range],
+}
+
+impl Task for AddBesideGaps<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<W: Width>(self, _: W) {
+        self.to.add_beside_gaps_now(self.mail, self.changed, self.seen);
+    }
+}
+
+/// [`bounds`] of several bricks with the widest vectors.
+pub struct Bounds<'a>(pub &'a [Spans]);
+
+impl Task for Bounds<'_> {
+    type Output = Vec<Option<([usize; 3], [usize; 3])>>;
+    #[inline(always)]
+    fn run<W: Width>(self, _: W) -> Self::Output {
+        self.0.iter().map(bounds).collect()
+    }
+}
+
 /// Box around the spans of a brick (inclusive); `None`: they are empty.
+#[inline(always)]
 pub fn bounds(spans: &Spans) -> Option<([usize; 3], [usize; 3])> {
     // by lanes: an empty span ends at 0
     let (mut first, mut end) = ([i16::MAX; EDGE], [0i16; EDGE]);

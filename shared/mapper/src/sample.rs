@@ -4,6 +4,7 @@
 //! bits at a voxel, and is exact for quadratics (error O(h³), the derivative continuous). The B-spline is smoother and one order better, but its
 //! coefficients come from a filter over the whole volume, a second copy of it, and no longer repeat the voxels bit for bit.
 
+use crate::vector::{Task, Width};
 use maille_volume::{
     Brick, BrickId, BrickSource,
     brick::{APRON_LOW, EDGE, ROW, SLICE, STORED_EDGE},
@@ -119,25 +120,13 @@ impl<'a, S: BrickSource + ?Sized> RestSampler<'a, S> {
     ///
     /// The same arithmetic as [`Self::linear`], four points at a time where one brick holds all their cells.
     #[inline(always)]
-    pub fn linear_row(&mut self, position: &[f32x4; EDGE], wanted: u32, void: i16, out: &mut [i16; EDGE]) -> u64 {
-        let mut voids = 0;
-        for from in (0..EDGE).step_by(4) {
-            let bits = wanted >> from & 0b1111;
-            if bits != 0 {
-                voids += self.four(position[from..].first_chunk().expect("EDGE is a multiple of four"), bits, void, &mut out[from..]);
-            }
-        }
-        voids
+    pub fn linear_row<W: Width>(&mut self, width: W, position: &[f32x4; EDGE], wanted: u32, void: i16, out: &mut [i16; EDGE]) -> u64 {
+        width.run(LinearRow { sampler: self, position, wanted, void, out })
     }
 
     /// The same of the points `wanted` among four.
     #[inline(always)]
-    fn four(&mut self, points: &[f32x4; 4], wanted: u32, void: i16, out: &mut [i16]) -> u64 {
-        let mut points = *points;
-        if wanted != 0b1111 {
-            let one = points[wanted.trailing_zeros() as usize];
-            (0..4).filter(|m| wanted >> m & 1 == 0).for_each(|m| points[m] = one);
-        }
+    fn four<W: Width>(&mut self, width: W, points: [f32x4; 4], wanted: u32, void: i16, out: &mut [i16; 4]) -> u64 {
         let [a, b, c, d] = points;
         let (least, most) = (a.fast_min(b).fast_min(c.fast_min(d)), a.fast_max(b).fast_max(c.fast_max(d)));
         let fit = |s: &Self| {
@@ -145,37 +134,44 @@ impl<'a, S: BrickSource + ?Sized> RestSampler<'a, S> {
             inside.to_bitmask() == 0b1111
         };
         if !fit(self) && (self.locate(a).is_none() || !fit(self)) {
-            let mut voids = 0;
-            for m in (0..4).filter(|m| wanted >> m & 1 == 1) {
-                let value = self.linear(points[m]);
-                voids += u64::from(value.is_none());
-                out[m] = value.unwrap_or(void);
-            }
-            return voids;
+            return self.one_by_one(&points, wanted, void, out);
         }
         let [x, y, z, _] = f32x4::transpose(points);
         let whole = [x, y, z].map(|v| v.fast_trunc_int().round_float());
         let step = |c: usize| whole[c] - f32x4::splat(self.corner[c]);
         // whole numbers below 2²⁴: exact
         let place = step(0) + step(1) * f32x4::splat(ROW as f32) + step(2) * f32x4::splat(SLICE as f32);
-        let (place, along) = (place.fast_trunc_int().to_array(), (x - whole[0]).to_array());
+        let place: i32x4 = place.fast_trunc_int();
+        // the four edges of each cell along i, a cell a lane
         let voxels = &self.brick.1.voxels;
-        let mut edges = [f32x4::ZERO; 4];
-        for (m, edge) in edges.iter_mut().enumerate() {
-            let cell = voxels[place[m] as usize..].first_chunk().expect("a brick holds the cells of its room");
-            *edge = along_edges(cell, along[m]);
-        }
-        let [a, b, c, d] = f32x4::transpose(edges);
+        let fx = x - whole[0];
+        let edge = |from: usize| {
+            let pairs = width.gather(&voxels[from..], place);
+            let (low, high): (i32x4, i32x4) = (pairs << 16 >> 16, pairs >> 16);
+            let (low, high) = (low.round_float(), high.round_float());
+            low + (high - low) * fx
+        };
+        let [a, b, c, d] = [edge(0), edge(ROW), edge(SLICE), edge(SLICE + ROW)];
         let lerp = |a: f32x4, b: f32x4, t: f32x4| a + (b - a) * t;
         let (fy, fz) = (y - whole[1], z - whole[2]);
         let value = lerp(lerp(a, b, fy), lerp(c, d, fy), fz);
         let value = (value + f32x4::splat(32_768.5)).fast_trunc_int().to_array().map(|v| (v - 32_768) as i16);
-        if wanted == 0b1111 {
-            out[..4].copy_from_slice(&value);
-        } else {
-            (0..4).filter(|m| wanted >> m & 1 == 1).for_each(|m| out[m] = value[m]);
+        let inside = FOUR[wanted as usize % 16];
+        for m in 0..4 {
+            out[m] ^= (out[m] ^ value[m]) & inside[m];
         }
         0
+    }
+
+    #[cold]
+    fn one_by_one(&mut self, points: &[f32x4; 4], wanted: u32, void: i16, out: &mut [i16; 4]) -> u64 {
+        let mut voids = 0;
+        for m in (0..4).filter(|m| wanted >> m & 1 == 1) {
+            let value = self.linear(points[m]);
+            voids += u64::from(value.is_none());
+            out[m] = value.unwrap_or(void);
+        }
+        voids
     }
 
     /// Trilinear value, rounded; `None` outside the grid.
@@ -190,6 +186,49 @@ impl<'a, S: BrickSource + ?Sized> RestSampler<'a, S> {
         Some((f32x4::splat(value + 32_768.5).fast_trunc_int().to_array()[0] - 32_768) as i16)
     }
 }
+
+/// [`RestSampler::linear_row`], a function of its own, so that it has the registers.
+struct LinearRow<'a, 'b, S: BrickSource + ?Sized> {
+    sampler: &'b mut RestSampler<'a, S>,
+    position: &'b [f32x4; EDGE],
+    wanted: u32,
+    void: i16,
+    out: &'b mut [i16; EDGE],
+}
+
+impl<S: BrickSource + ?Sized> Task for LinearRow<'_, '_, S> {
+    type Output = u64;
+    #[inline(always)]
+    fn run<W: Width>(self, width: W) -> u64 {
+        let Self { sampler, position, wanted, void, out } = self;
+        if wanted == 0 {
+            return 0;
+        }
+        // one that is there stands for those that are not
+        let one = position[wanted.trailing_zeros() as usize % EDGE];
+        let mut voids = 0;
+        for ((group, out), points) in out.as_chunks_mut::<4>().0.iter_mut().enumerate().zip(position.as_chunks::<4>().0) {
+            let bits = wanted >> (4 * group) & 0b1111;
+            if bits == 0 {
+                continue;
+            }
+            let inside = &FOUR[bits as usize];
+            let points = std::array::from_fn(|m| f32x4::splat(f32::from_bits(i32::from(inside[m]) as u32)).bitselect(points[m], one));
+            voids += sampler.four(width, points, bits, void, out);
+        }
+        voids
+    }
+}
+
+/// All bits of the lanes of a set.
+static FOUR: [[i16; 4]; 16] = {
+    let (mut out, mut n) = ([[0; 4]; 16], 0);
+    while n < 64 {
+        out[n / 4][n % 4] = -(((n / 4) >> (n % 4) & 1) as i16);
+        n += 1;
+    }
+    out
+};
 
 /// Values on the four edges of a cell along i, a fraction `x` from their lower ends.
 #[inline(always)]

@@ -11,11 +11,11 @@ use crate::{
     rows::{Box3, ROWS, Spans, bounds},
     sample::{RestSampler, Sampling},
     search::{self, Open, OpenVoxels},
-    vector::{Task, widest},
-    window::Window,
+    vector::{Task, Width, widest},
+    window::{Wide, Window},
 };
 use maille_chainmail::{ChainMail, DisplacementBrick};
-use maille_displacement::{DisplacementField, Inverter, Scheme};
+use maille_displacement::{DisplacementField, Inverter, RowOutcome, Scheme};
 use maille_volume::{Brick, BrickId, BrickSource, brick::EDGE};
 use wide::f32x4;
 
@@ -25,8 +25,10 @@ pub type Values = [i16; EDGE * EDGE * EDGE];
 /// Working memory of one thread.
 pub struct Workspace {
     pub window: Window,
-    /// rows to be solved
-    open: Box<Spans>,
+    /// voxels to be solved (bits of each row)
+    open: Box<[u64; ROWS]>,
+    /// which elements of them are displaced (bits)
+    moved: Box<[u64; ROWS]>,
     /// x − X of the rows solved [voxels]
     found: Box<[[f32x4; EDGE]; ROWS]>,
     /// tissue and cuts around, where there are any
@@ -39,7 +41,8 @@ impl Workspace {
     pub fn new() -> Self {
         Self {
             window: Window::new(),
-            open: Box::new([[0; 2]; ROWS]),
+            open: Box::new([0; ROWS]),
+            moved: Box::new([0; ROWS]),
             found: Box::new([[f32x4::ZERO; EDGE]; ROWS]),
             pieces: Pieces::default(),
             left: OpenVoxels::new(),
@@ -80,28 +83,46 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
     }
 
     #[inline(always)]
-    fn solve(&self, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
+    fn solve<W: Width>(&self, width: W, work: &mut Workspace, id: BrickId, spans: &Spans, values: &mut Values) -> MapReport {
         let mut report = MapReport::default();
         let first = self.mail.layout().first_voxel(id);
         let displacement = self.mail.displacement_brick(id).filter(|_| self.mail.displacement_range(id) != [[0.0; 2]; 3]);
         // 1. rest values everywhere; what is left are the rows whose elements moved
         let (rest, values) = (self.rest.brick(id), values.as_chunks_mut::<EDGE>().0);
         let voids = self.mail.tissue().threshold_hu.is_some();
-        for (row, span) in spans.iter().enumerate().filter(|(_, s)| s[1] > 0) {
-            let from = Brick::offset(0, (row % EDGE) as isize, (row / EDGE) as isize);
-            values[row].copy_from_slice(&rest.voxels[from..from + EDGE]);
-            report.voxels += u64::from(span[1] - span[0]);
-        }
         let all_open = voids || self.mail.cut_brick(id).is_some();
-        let open = &mut *work.open;
-        for (row, span) in spans.iter().enumerate() {
-            // a void may be entered by others, and tissue at rest be taken out
-            open[row] = if all_open { *span } else { displacement.map_or([0; 2], |d| moved_span(d, row, *span)) };
+        let Some((low, high)) = bounds(spans) else { return report };
+        let (open, moved) = (&mut *work.open, &mut *work.moved);
+        open.fill(0);
+        let (mut any, mut rows) = (0, [[usize::MAX, 0]; 2]);
+        for k in low[2]..=high[2] {
+            for j in low[1]..=high[1] {
+                let row = k * EDGE + j;
+                let [from, to] = spans[row];
+                if to == 0 {
+                    continue;
+                }
+                report.voxels += u64::from(to - from);
+                let start = Brick::offset(0, j as isize, k as isize);
+                values[row].copy_from_slice(&rest.voxels[start..start + EDGE]);
+                let wanted = bits(from, to);
+                moved[row] = displacement.map_or(0, |d| moved_bits(d, row)) & wanted;
+                // a void may be entered by others, and tissue at rest be taken out; else from the first to the last that moved
+                open[row] = if all_open { wanted } else { filled(moved[row]) };
+                any |= open[row];
+                if open[row] != 0 {
+                    rows = [[rows[0][0].min(j), rows[0][1].max(j)], [rows[1][0].min(k), rows[1][1].max(k)]];
+                }
+            }
         }
-        let Some((low, high)) = bounds(open) else { return report };
+        if any == 0 {
+            return report;
+        }
+        let low = [any.trailing_zeros() as usize, rows[0][0], rows[1][0]];
+        let high = [63 - any.leading_zeros() as usize, rows[0][1], rows[1][1]];
         let voxels = Box3 { low: std::array::from_fn(|c| first[c] + low[c]), high: std::array::from_fn(|c| first[c] + high[c]) };
         let range = if self.gaps { preimage_box_beside_gaps(self.mail, voxels, &self.loaded) } else { preimage_box(self.mail, voxels) };
-        work.window.gather(self.mail, range);
+        work.window.gather(width, self.mail, range);
         if work.window.at_rest() && self.mail.cut_brick(id).is_none() {
             return report;
         }
@@ -118,38 +139,47 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
         let mut sampler = RestSampler::new(self.rest, origin, window.size(), self.options.sampling);
         let local: [f32; 3] = std::array::from_fn(|c| first[c] as f32 - origin[c] as f32);
         let linear = self.options.sampling == Sampling::Linear;
-        let (mut target, mut position, mut converged) = ([f32x4::ZERO; EDGE], [f32x4::ZERO; EDGE], [false; EDGE]);
-        for (row, span) in open.iter().enumerate().filter(|(_, s)| s[1] > 0) {
-            let range = span[0] as usize..span[1] as usize;
+        let mut position = [f32x4::ZERO; EDGE];
+        for (row, &here) in open.iter().enumerate().filter(|(_, bits)| **bits != 0) {
+            let range = here.trailing_zeros() as usize..64 - here.leading_zeros() as usize;
             let out = &mut values[row];
             // 2. pre-images, in positions relative to the window's first element
             let (j, k) = (row % EDGE, row / EDGE);
-            let mut place = f32x4::new([local[0] + range.start as f32, local[1] + j as f32, local[2] + k as f32, 0.0]);
-            for x in &mut target[range.clone()] {
-                *x = place;
-                place += f32x4::new([1.0, 0.0, 0.0, 0.0]);
-            }
+            let row_start = f32x4::new([local[0], local[1] + j as f32, local[2] + k as f32, 0.0]);
             let at = |c: usize, v: usize| first[c] + v - origin[c];
             let own = &window.row(at(1, j), at(2, k))[at(0, range.start)..at(0, range.end)];
-            guess(open, found, own, row, range.clone(), &target, &mut position);
-            report.iterations += u64::from(self.inverter.invert_row(window, &target, range.clone(), &mut position, &mut converged));
-            for i in range.clone() {
-                found[row][i] = target[i] - position[i];
-            }
+            // where the rows before were solved; all of them are there, whatever they hold
+            let (before, guessed) = if j > 0 && k > 0 {
+                let rows = [row - 1, row - EDGE, row - EDGE - 1];
+                (rows, rows.iter().fold(here, |bits, &r| bits & open[r]))
+            } else {
+                ([0; 3], 0)
+            };
+            let (before_found, found) = found.split_at_mut(row);
+            let outcome = width.run(Row {
+                inverter: &self.inverter,
+                window,
+                start: row_start,
+                range: range.clone(),
+                own,
+                before: before.map(|r| before_found.get(r).unwrap_or(&REST)),
+                guessed,
+                position: &mut position,
+                found: &mut found[0],
+            });
+            report.iterations += u64::from(outcome.evaluations);
             // 3. values. X = x is the exact pre-image of what did not move; the kernel stops within its tolerance of it
-            let still = |i: usize| f32x4::new(own[i - range.start]).simd_eq(f32x4::ZERO).to_bitmask() == 0b1111;
-            if all_linked && linear && converged[range.clone()].iter().all(|&c| c) {
-                let moved = range.clone().fold(0, |bits, i| bits | u32::from(!still(i)) << i);
-                report.voids += sampler.linear_row(&position, moved, self.void, out);
+            if all_linked && linear && outcome.open == 0 {
+                report.voids += sampler.linear_row(width, &position, moved[row] as u32, self.void, out);
                 continue;
             }
             // the few that did not converge, and what lies beside voids and cuts, are left
             for i in range.clone() {
-                if still(i) && pieces.is_tissue([at(0, i), at(1, j), at(2, k)]) {
+                if moved[row] >> i & 1 == 0 && pieces.is_tissue([at(0, i), at(1, j), at(2, k)]) {
                     continue;
                 }
-                let (target, near) = (xyz(target[i]), position[i]);
-                let near = if converged[i] { near } else { self.damped(window, target, &mut report) };
+                let (target, near) = (xyz(row_start + f32x4::new(UNITS[i])), position[i]);
+                let near = if outcome.open >> i & 1 == 0 { near } else { self.damped(window, target, &mut report) };
                 if near.to_array()[3] == 0.0 && (all_linked || pieces.is_whole(xyz(near))) {
                     let value = sampler.stored(near);
                     report.voids += u64::from(value.is_none());
@@ -208,11 +238,11 @@ impl<'a, S: BrickSource + ?Sized> Solver<'a, S> {
     }
 
     /// Folded cells among those whose lower corner is to be solved.
-    fn folded(&self, first: [usize; 3], open: &Spans, window: &Window, pieces: &Pieces) -> u64 {
+    fn folded(&self, first: [usize; 3], open: &[u64; ROWS], window: &Window, pieces: &Pieces) -> u64 {
         let (low, size) = (window.low(), window.size());
         let mut count = 0;
-        for (row, span) in open.iter().enumerate() {
-            for i in span[0] as usize..span[1] as usize {
+        for (row, bits) in open.iter().enumerate() {
+            for i in (0..EDGE).filter(|i| bits >> i & 1 == 1) {
                 let base: [usize; 3] = std::array::from_fn(|c| first[c] + [i, row % EDGE, row / EDGE][c] - low[c]);
                 count += u64::from((0..3).all(|c| base[c] + 2 <= size[c]) && search::is_folded(window, pieces, base));
             }
@@ -233,60 +263,84 @@ struct Job<'a, 'b, S: BrickSource + ?Sized> {
 impl<S: BrickSource + ?Sized> Task for Job<'_, '_, S> {
     type Output = MapReport;
     #[inline(always)]
-    fn run(self) -> MapReport {
-        self.solver.solve(self.work, self.id, self.spans, self.values)
+    fn run<W: Width>(self, width: W) -> MapReport {
+        self.solver.solve(width, self.work, self.id, self.spans, self.values)
     }
 }
 
-/// The part of a span of a brick's row between its first and its last moved element.
-#[inline(always)]
-fn moved_span(displacement: &DisplacementBrick, row: usize, [from, to]: [u8; 2]) -> [u8; 2] {
-    if to == 0 {
-        return [0; 2];
+/// Nothing moved.
+static REST: [f32x4; EDGE] = [f32x4::ZERO; EDGE];
+
+/// The pre-images of a row, in positions relative to the window's first element: a function of its own, so that it has the registers.
+struct Row<'a> {
+    inverter: &'a Inverter,
+    window: &'a Window,
+    /// position of the brick's voxel at i = 0
+    start: f32x4,
+    range: std::ops::Range<usize>,
+    /// displacements of the elements in the range
+    own: &'a [[f32; 4]],
+    /// x − X of the rows at (j − 1, k), (j, k − 1), (j − 1, k − 1), and where they have it (bits)
+    before: [&'a [f32x4; EDGE]; 3],
+    guessed: u64,
+    position: &'a mut [f32x4; EDGE],
+    /// x − X
+    found: &'a mut [f32x4; EDGE],
+}
+
+impl Task for Row<'_> {
+    type Output = RowOutcome;
+    #[inline(always)]
+    fn run<W: Width>(self, width: W) -> RowOutcome {
+        let Self { inverter, window, start: first, range, own, before: [below, behind, corner], guessed, position, found } = self;
+        let target = |i: usize| first + f32x4::new(UNITS[i % EDGE]);
+        let (from, own) = (range.start, &own[..range.len()]);
+        let start = |i: usize| {
+            let guess = below[i % EDGE] + behind[i % EDGE] - corner[i % EDGE];
+            let mask = f32x4::splat(f32::from_bits(((guessed >> i & 1) as u32).wrapping_neg()));
+            target(i) - mask.bitselect(guess, f32x4::new(own[i - from]))
+        };
+        let outcome = inverter.invert_row_from(&Wide::new(window, width), target, range.clone(), start, position);
+        for i in range {
+            found[i % EDGE] = target(i) - position[i % EDGE];
+        }
+        outcome
     }
+}
+
+/// Which elements of a brick's row are displaced.
+#[inline(always)]
+fn moved_bits(displacement: &DisplacementBrick, row: usize) -> u64 {
     let [x, y, z] = displacement.u.each_ref().map(|plane| plane[row * EDGE..][..EDGE].as_chunks::<4>().0);
     let mut moved = 0u64;
     for part in 0..EDGE / 4 {
         let any = f32x4::new(x[part]) | f32x4::new(y[part]) | f32x4::new(z[part]);
         moved |= u64::from(any.simd_ne(f32x4::ZERO).to_bitmask()) << (4 * part);
     }
-    moved &= u64::MAX << from & (u64::MAX >> (64 - u32::from(to)));
-    if moved == 0 { [0; 2] } else { [moved.trailing_zeros() as u8, 64 - moved.leading_zeros() as u8] }
+    moved
 }
 
-/// Where a row starts: by the rows before it; where those are not there, by the voxels' own displacements.
+/// The bits of a span that is not empty.
 #[inline(always)]
-fn guess(
-    spans: &Spans,
-    found: &[[f32x4; EDGE]; ROWS],
-    own: &[[f32; 4]],
-    row: usize,
-    range: std::ops::Range<usize>,
-    target: &[f32x4; EDGE],
-    position: &mut [f32x4; EDGE],
-) {
-    let mut common = range.clone();
-    if !row.is_multiple_of(EDGE) && row >= EDGE {
-        for before in [row - 1, row - EDGE, row - EDGE - 1] {
-            common = common.start.max(spans[before][0].into())..common.end.min(spans[before][1].into());
-        }
-    } else {
-        common.end = common.start;
-    }
-    if common.is_empty() {
-        common = range.end..range.end;
-    }
-    for i in (range.start..common.start).chain(common.end..range.end) {
-        position[i] = target[i] - f32x4::new(own[i - range.start]);
-    }
-    if common.is_empty() {
-        return;
-    }
-    let (below, before, corner) = (&found[row - 1], &found[row - EDGE], &found[row - EDGE - 1]);
-    for i in common {
-        position[i] = target[i] - (below[i] + before[i] - corner[i]);
-    }
+fn bits(from: u8, to: u8) -> u64 {
+    u64::MAX << from & u64::MAX >> (64 - u32::from(to))
 }
+
+/// All bits from the first to the last.
+#[inline(always)]
+fn filled(set: u64) -> u64 {
+    if set == 0 { 0 } else { u64::MAX << set.trailing_zeros() & u64::MAX >> set.leading_zeros() }
+}
+
+/// Steps along a row.
+static UNITS: [[f32; 4]; EDGE] = {
+    let (mut out, mut i) = ([[0.0; 4]; EDGE], 0);
+    while i < EDGE {
+        out[i][0] = i as f32;
+        i += 1;
+    }
+    out
+};
 
 #[inline(always)]
 fn xyz(v: f32x4) -> [f32; 3] {

@@ -12,6 +12,7 @@ use crate::{
     BrickSink, MapReport,
     rows::Cover,
     solve::Values,
+    vector::Plain,
     window::Window,
     {Box3, reach::preimage_box, write},
 };
@@ -55,7 +56,7 @@ where
     // all elements that matter in one dense window, as fast to read as can be
     let mut window = Window::new();
     let reach = Box3 { low: low.map(|v| v.saturating_sub(1)), high: std::array::from_fn(|c| (high[c] + 1).min(layout.size[c] - 1)) };
-    window.gather(mail, preimage_box(mail, reach));
+    window.gather(Plain, mail, preimage_box(mail, reach));
     let mut search = Search { window: &window, split, last: layout.size };
     let origin = window.low();
     let mut wanted = Cover::default();

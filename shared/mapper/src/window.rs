@@ -1,6 +1,9 @@
 //! A window of the displacement field around some voxels, in index units, padded so that one register holds one element.
 
-use crate::rows::Box3;
+use crate::{
+    rows::Box3,
+    vector::{Elements, Plain, Width},
+};
 use maille_chainmail::{ChainMail, DisplacementBrick};
 use maille_displacement::{DisplacementField, FieldSample, RowField};
 use maille_volume::brick::EDGE;
@@ -44,14 +47,14 @@ impl Window {
 
     /// Copies the elements of a box (inclusive, inside the volume).
     #[inline(always)]
-    pub fn gather(&mut self, mail: &ChainMail, range: Box3) {
+    pub fn gather<W: Width>(&mut self, width: W, mail: &ChainMail, range: Box3) {
         let layout = mail.layout();
         self.low = range.low;
         self.size = std::array::from_fn(|c| (range.high[c] - range.low[c] + 1).max(2));
         self.last = register(self.size.map(|s| (s - 1) as f32));
         self.last_cell = register(self.size.map(|s| (s - 2) as f32));
         self.u.resize(self.size.iter().product(), [0.0; 4]);
-        let per_mm = register(mail.spacing().map(|s| 1.0 / s));
+        let per_mm = mail.spacing().map(|s| 1.0 / s);
         let bricks = |c: usize| range.low[c] / EDGE..=range.high[c] / EDGE;
         self.at_rest = true;
         for bk in bricks(2) {
@@ -60,7 +63,7 @@ impl Window {
                     let id = layout.id([bi, bj, bk]);
                     let brick = mail.displacement_brick(id).filter(|_| mail.displacement_range(id) != [[0.0; 2]; 3]);
                     self.at_rest &= brick.is_none();
-                    self.copy_brick(brick, per_mm, [bi, bj, bk].map(|b| b * EDGE), range);
+                    self.copy_brick(width, brick, per_mm, [bi, bj, bk].map(|b| b * EDGE), range);
                 }
             }
         }
@@ -76,7 +79,7 @@ impl Window {
 
     /// Copies the part of one brick that lies in the window; `None`: it is at rest.
     #[inline(always)]
-    fn copy_brick(&mut self, brick: Option<&DisplacementBrick>, per_mm: f32x4, first: [usize; 3], range: Box3) {
+    fn copy_brick<W: Width>(&mut self, width: W, brick: Option<&DisplacementBrick>, per_mm: [f32; 3], first: [usize; 3], range: Box3) {
         let part = |c: usize| first[c].max(range.low[c])..(first[c] + EDGE).min(range.high[c] + 1);
         let (from, count) = (part(0).start, part(0).len());
         for k in part(2) {
@@ -88,17 +91,7 @@ impl Window {
                     continue;
                 };
                 let n = DisplacementBrick::offset(from - first[0], j - first[1], k - first[2]);
-                let [x, y, z] = [0, 1, 2].map(|c| &brick.u[c][n..n + count]);
-                let (out, rest) = out.as_chunks_mut::<4>();
-                let ((x, rx), (y, ry), (z, rz)) = (x.as_chunks::<4>(), y.as_chunks::<4>(), z.as_chunks::<4>());
-                for (n, out) in out.iter_mut().enumerate() {
-                    // four elements at once: three planes become four registers
-                    let planes = [f32x4::new(x[n]), f32x4::new(y[n]), f32x4::new(z[n]), f32x4::ZERO];
-                    *out = f32x4::transpose(planes).map(|v| (v * per_mm).to_array());
-                }
-                for (n, out) in rest.iter_mut().enumerate() {
-                    *out = (register([rx[n], ry[n], rz[n]]) * per_mm).to_array();
-                }
+                width.interleave([0, 1, 2].map(|c| &brick.u[c][n..n + count]), per_mm, out);
             }
         }
     }
@@ -131,16 +124,16 @@ impl Window {
 
     /// Flat offset of a cell's lower corner, fractions, and what was clamped.
     #[inline(always)]
-    fn locate(&self, local: f32x4) -> (usize, [f32x4; 3], f32x4) {
+    fn locate(&self, local: f32x4) -> (usize, f32x4, f32x4) {
         // SSE's maximum gives the second operand for a NaN: it becomes 0 here and is caught by the solver's residual
         let inside = local.fast_max(f32x4::ZERO).fast_min(self.last);
         let cell = inside.fast_min(self.last_cell).fast_trunc_int();
-        let f = (inside - cell.round_float()).to_array();
+        let f = inside - cell.round_float();
         let [i, j, k, _] = cell.to_array();
         let (i, j, k) = (i as usize, j as usize, k as usize);
         // what is no number and no zero (another processor's maximum) must not leave the window
-        let at = ((k * self.size[1] + j) * self.size[0] + i).min(self.u.len() - 2 - self.size[0] * (self.size[1] + 1));
-        (at, [f32x4::splat(f[0]), f32x4::splat(f[1]), f32x4::splat(f[2])], inside)
+        let at = (k * (self.size[1] * self.size[0]) + j * self.size[0] + i).min(self.u.len() - 2 - self.size[0] * (self.size[1] + 1));
+        (at, f, inside)
     }
 
     /// The four pairs of neighbours along i around a cell at (j, k) = (0,0), (1,0), (0,1), (1,1).
@@ -163,19 +156,67 @@ fn lerp(a: f32x4, b: f32x4, t: f32x4) -> f32x4 {
     a + (b - a) * t
 }
 
-impl RowField for Window {
+/// A window read by vectors of a width.
+#[derive(Clone, Copy)]
+pub struct Wide<'a, W> {
+    window: &'a Window,
+    width: W,
+    elements: Elements<'a>,
+    last: f32x4,
+    last_cell: f32x4,
+    row: u32,
+    slice: u32,
+}
+
+impl<'a, W: Width> Wide<'a, W> {
+    /// The window as it is now.
+    #[inline(always)]
+    pub fn new(window: &'a Window, width: W) -> Self {
+        let [nx, ny, _] = window.size;
+        let elements = Elements::new(&window.u, window.size);
+        Self { window, width, elements, last: window.last, last_cell: window.last_cell, row: nx as u32, slice: (nx * ny) as u32 }
+    }
+}
+
+impl<W: Width> RowField for Wide<'_, W> {
     /// Trilinear between elements at a *local* position.
     #[inline(always)]
     fn value(&self, local: f32x4) -> f32x4 {
-        let (at, [x, y, z], _) = self.locate(local);
-        let [a, b, c, d] = self.pairs(at);
-        let (a, b, c, d) = (lerp(a[0], a[1], x), lerp(b[0], b[1], x), lerp(c[0], c[1], x), lerp(d[0], d[1], x));
-        lerp(lerp(a, b, y), lerp(c, d, y), z)
+        // as `locate`; elements of a window are numbered by u32
+        let inside = local.fast_max(f32x4::ZERO).fast_min(self.last);
+        let cell = inside.fast_min(self.last_cell).fast_trunc_int();
+        let f = inside - cell.round_float();
+        let [i, j, k, _] = cell.to_array().map(|v| v as u32);
+        let at = k.wrapping_mul(self.slice).wrapping_add(j.wrapping_mul(self.row)).wrapping_add(i);
+        let [_, y, z, _] = f.to_array();
+        // neighbours along i travel together
+        let [a, b, c, d] = self.width.cell(&self.elements, at as usize);
+        let (low, high) = (self.width.lerp(a, b, y), self.width.lerp(c, d, y));
+        let [a, b] = self.width.elements(self.width.lerp(low, high, z));
+        lerp(a, b, splat::<0>(f))
     }
 
     #[inline(always)]
     fn jet(&self, local: f32x4) -> (f32x4, [f32x4; 3]) {
-        let (at, [x, y, z], inside) = self.locate(local);
+        self.window.jet(local)
+    }
+}
+
+#[inline(always)]
+fn splat<const LANE: usize>(v: f32x4) -> f32x4 {
+    f32x4::splat(v.to_array()[LANE])
+}
+
+impl RowField for Window {
+    #[inline(always)]
+    fn value(&self, local: f32x4) -> f32x4 {
+        Wide::new(self, Plain).value(local)
+    }
+
+    #[inline(always)]
+    fn jet(&self, local: f32x4) -> (f32x4, [f32x4; 3]) {
+        let (at, f, inside) = self.locate(local);
+        let [x, y, z] = [splat::<0>(f), splat::<1>(f), splat::<2>(f)];
         let p = self.pairs(at);
         let [a, b, c, d] = p.map(|[low, high]| lerp(low, high, x));
         let [da, db, dc, dd] = p.map(|[low, high]| high - low);

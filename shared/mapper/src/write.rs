@@ -3,9 +3,9 @@
 
 use crate::{
     BrickSink,
-    rows::{Cover, bounds},
+    rows::{Bounds, Cover},
     solve::Values,
-    vector::{Task, widest},
+    vector::{Task, Width, widest},
 };
 use maille_volume::{
     BrickId, BrickLayout,
@@ -36,6 +36,14 @@ impl Pieces {
     /// Of the brick at coordinate `brick` of an axis with `size` voxels.
     fn new(brick: usize, size: usize) -> Self {
         let mut out = Self { all: [Piece { to: 0, brick: 0, from: 0, count: 0 }; STORED_EDGE], count: 0 };
+        // most bricks lie inside
+        if brick > 0 && (brick + 1) * EDGE + APRON_HIGH <= size {
+            out.all[0] = Piece { to: -(APRON_LOW as isize), brick: brick - 1, from: EDGE - APRON_LOW, count: APRON_LOW };
+            out.all[1] = Piece { to: 0, brick, from: 0, count: EDGE };
+            out.all[2] = Piece { to: EDGE as isize, brick: brick + 1, from: 0, count: APRON_HIGH };
+            out.count = 3;
+            return out;
+        }
         for to in -(APRON_LOW as isize)..(EDGE + APRON_HIGH) as isize {
             // beyond the border the last voxel repeats
             let voxel = ((brick * EDGE) as isize + to).clamp(0, size as isize - 1) as usize;
@@ -58,7 +66,7 @@ impl Pieces {
 /// Edits the bricks that show a solved voxel with a new value; their numbers, ascending.
 pub fn write<K: BrickSink + ?Sized>(layout: &BrickLayout, wanted: &Cover, values: &[Values], sink: &mut K) -> Vec<BrickId> {
     let mut showing = Vec::with_capacity(4 * wanted.ids.len());
-    let boxes: Vec<_> = wanted.spans.iter().map(bounds).collect();
+    let boxes = widest(Bounds(&wanted.spans));
     for (id, bounds) in wanted.ids.iter().zip(&boxes) {
         let first = layout.first_voxel(*id);
         let Some((low, high)) = bounds else { continue };
@@ -105,7 +113,7 @@ struct Compare<'a> {
 impl Task for Compare<'_> {
     type Output = bool;
     #[inline(always)]
-    fn run(self) -> bool {
+    fn run<W: Width>(self, _: W) -> bool {
         self.source.visit(|at, row, part| {
             let (to, stored) = (Brick::offset(at[0], at[1], at[2]), &self.old.voxels);
             match row[part.clone()] {
@@ -153,7 +161,7 @@ struct Copy<'a> {
 impl Task for Copy<'_> {
     type Output = ();
     #[inline(always)]
-    fn run(self) {
+    fn run<W: Width>(self, _: W) {
         let Self { source, brick } = self;
         let (mut low, mut high) = ([isize::MAX; 3], [isize::MIN; 3]);
         source.visit(|at, row, part| {
