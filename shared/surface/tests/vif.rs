@@ -90,7 +90,7 @@ fn surfaces_are_closed_of_their_genus_and_twice_as_near_to_the_truth_as_the_voxe
                 println!("{name}, noise {noise}: voxels' mesh {distance:.4} mm {angle:.2}°; function of {what} {d:.4} mm {a:.2}°");
                 if what != "coarse" {
                     assert!(a <= 0.55 * angle, "{name} of {what}: {a}° against {angle}");
-                    // under noise a window of five voxels flattens a ball of 6 mm by as much as it steadies it
+                    // under noise a window of five voxels flattens a ball of 6 mm about as much as it steadies it
                     let part = if noise == 0.0 {
                         0.5
                     } else if name == "small ball" {
