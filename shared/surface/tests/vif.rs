@@ -91,13 +91,7 @@ fn surfaces_are_closed_of_their_genus_and_twice_as_near_to_the_truth_as_the_voxe
                 if what != "coarse" {
                     assert!(a <= 0.55 * angle, "{name} of {what}: {a}° against {angle}");
                     // under noise a window of five voxels flattens a ball of 6 mm about as much as it steadies it
-                    let part = if noise == 0.0 {
-                        0.5
-                    } else if name == "small ball" {
-                        1.2
-                    } else {
-                        0.8
-                    };
+                    let part = if noise == 0.0 { 0.5 } else { 1.2 };
                     assert!(d <= part * distance, "{name} of {what}: {d} mm against {distance}");
                 }
             }
