@@ -124,6 +124,21 @@ impl Spline {
         })
     }
 
+    /// Whether the cell that begins at a lattice point may hold a value; it does not if false.
+    pub(crate) fn cell_holds(&self, low: [usize; 3], value: f64) -> bool {
+        let Some((at, _)) = self.cell(low.map(|v| v as f64)) else { return false };
+        let stored = ((value - self.intercept) / self.slope) as f32;
+        let (row, slice) = (self.extent[0], self.extent[0] * self.extent[1]);
+        let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+        for k in 0..4 {
+            for j in 0..4 {
+                let line = &self.coefficients[at + k * slice + j * row..][..4];
+                range = line.iter().fold(range, |r, &c| [r[0].min(c), r[1].max(c)]);
+            }
+        }
+        range[0] <= stored && stored <= range[1]
+    }
+
     /// Offset of the first of the 4³ coefficients of a point, and its fractions; `None` where the spline has no value.
     #[inline(always)]
     fn cell(&self, index: [f64; 3]) -> Option<(usize, [f32; 3])> {
