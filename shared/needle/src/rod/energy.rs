@@ -83,7 +83,18 @@ impl Rod {
                 energy += 0.5 * self.drag_of(i) * (shape.nodes[i] - self.start.nodes[i]).norm_squared();
             }
         }
+        if self.turn_drag > 0.0 {
+            for i in 0..m {
+                energy += 0.5 * self.turn_drag * self.turned(i, trial).norm_squared();
+            }
+        }
         energy
+    }
+
+    /// How a segment has turned since the step began [rad], patient frame.
+    pub(super) fn turned(&self, segment: usize, trial: bool) -> V3 {
+        let shape = if trial { &self.trial } else { &self.shape };
+        so3::log(&(shape.turns[segment] * self.start.turns[segment].inverse()))
     }
 
     /// Moments (and second derivatives) of the joints that [`Rod::measure`] left, at the current shape.

@@ -130,6 +130,8 @@ pub struct Rod {
     start: Shape,
     /// c/Δt of a node inside [N/mm]
     drag: f64,
+    /// resistance of a segment to turns [N·mm], in steps that are made anew: drag alone does not hold a twist
+    turn_drag: f64,
     joints: Vec<energy::Joint>,
     stages: Vec<Stage>,
     /// inverse of the block of the base
@@ -212,6 +214,7 @@ impl Rod {
             trial: shape.clone(),
             start: shape.clone(),
             drag: 0.0,
+            turn_drag: 0.0,
             joints: vec![energy::Joint::default(); m + 1],
             stages: vec![Stage::default(); m],
             base_inverse: M3::zeros(),
@@ -317,7 +320,8 @@ impl Rod {
         let loads: f64 = self.attachments.iter().map(|a| a.force_n.dot(&self.point(a.arc_mm))).sum();
         let drag: f64 =
             (0..self.start.nodes.len()).map(|i| 0.5 * self.drag_of(i) * (self.shape.nodes[i] - self.start.nodes[i]).norm_squared()).sum();
-        self.energy + loads - drag
+        let turns: f64 = (0..self.shape.turns.len()).map(|i| self.turned(i, false).norm_squared()).sum();
+        self.energy + loads - drag - 0.5 * self.turn_drag * turns
     }
 
     /// Force of the needle on its grip [N].

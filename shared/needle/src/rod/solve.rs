@@ -49,6 +49,7 @@ impl Rod {
         let mut solved = Solved::default();
         for attempt in 0..attempts {
             self.drag = if attempt == 0 { drag } else { drag.max(least_drag) * 100f64.powi(attempt as i32) };
+            self.turn_drag = if attempt == 0 { 0.0 } else { self.drag * self.segment_mm * self.segment_mm };
             self.shape.copy_from(&self.start);
             self.descend(&mut solved, bound as u32, least_drag);
             solved.slowed = attempt as u32;

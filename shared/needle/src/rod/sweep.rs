@@ -51,7 +51,8 @@ impl Rod {
         let m = self.shape.turns.len();
         for i in 0..m {
             let drag = (self.shape.nodes[i] - self.start.nodes[i]) * self.drag_of(i);
-            (self.stages[i].force, self.stages[i].turn) = (drag, V3::zeros());
+            let turn = if self.turn_drag > 0.0 { self.turned(i, false) * self.turn_drag } else { V3::zeros() };
+            (self.stages[i].force, self.stages[i].turn) = (drag, turn);
         }
         for n in 0..self.attachments.len() {
             let a = self.attachments[n];
@@ -92,7 +93,7 @@ impl Rod {
                 let g = k * (self.shape.nodes[i] + lever - a.target_mm) - a.force_n;
                 b.tt += bent(&g, &lever);
             }
-            b.tt += bent(&beyond, &arm);
+            b.tt += bent(&beyond, &arm) + M3::identity() * self.turn_drag;
             beyond += self.stages[i].force;
             let joint = &self.joints[i];
             let lever = -cross(&arm);
