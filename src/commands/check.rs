@@ -1,6 +1,7 @@
 //! `maille check`: the plan of a scene, printed.
 
 use super::{Failure, Outcome};
+use maille_breathing::Prepared;
 use maille_phantom::{Kind, Phantom};
 use maille_scene::{
     BoxMm, Machine, PhantomKind, Plan, Scene, VolumeSource, Waypoints, limits,
@@ -36,6 +37,9 @@ pub struct Args {
     /// Volume in place of the scene's own
     #[arg(long, value_name = "F")]
     volume: Option<PathBuf>,
+    /// Motion model in place of the scene's own
+    #[arg(long, value_name = "MODEL")]
+    motion: Option<PathBuf>,
     /// Print one JSON object on standard output and nothing else there
     #[arg(long)]
     json: bool,
@@ -44,17 +48,24 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let report = |e: maille_scene::SceneError| Failure::Report(e.into());
-    let scene = Scene::open(args.scene.as_deref(), args.volume.as_deref()).map_err(report)?;
+    let mut scene = Scene::open(args.scene.as_deref(), args.volume.as_deref()).map_err(report)?;
+    if let Some(motion) = &args.motion {
+        scene.use_motion(motion.clone()).map_err(report)?;
+    }
     let patient = Patient::of(&scene.volume.source())?;
     let grid = &patient.info().grid;
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let plan = plan(&scene, grid, Machine { cores });
+    let mut plan = plan(&scene, grid, Machine { cores });
+    let breath = maille_breathing::prepare(&scene, grid).map_err(|e| Failure::Refused(e.to_string()))?;
+    for (name, meaning, bytes) in breath.iter().flat_map(Prepared::segments) {
+        plan.add_region(name, meaning, bytes);
+    }
     let way = scene.resolve_path(&BoxMm::of(grid), |at| patient.value(at)).map_err(report)?;
     let memory = Memory::of(&plan, patient.info());
     if args.json {
-        say!("{}", json_of(&scene, &patient, &plan, way.as_ref(), &memory));
+        say!("{}", json_of(&scene, &patient, &plan, breath.as_ref(), way.as_ref(), &memory));
     } else {
-        print_text(&scene, &patient, &plan, way.as_ref(), &memory);
+        print_text(&scene, &patient, &plan, breath.as_ref(), way.as_ref(), &memory);
     }
     match memory.free {
         Some(free) if free < memory.total() => Err(Failure::Refused(format!(
@@ -161,7 +172,7 @@ fn ends(way: &Waypoints) -> ([f64; 3], [f64; 3]) {
     (first.position_mm, deepest.unwrap_or(first.position_mm))
 }
 
-fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoints>, memory: &Memory) {
+fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, breath: Option<&Prepared>, way: Option<&Waypoints>, memory: &Memory) {
     let grid = &patient.info().grid;
     let triple = |v: [f64; 3], digits: usize| format!("{:.digits$}, {:.digits$}, {:.digits$}", v[0], v[1], v[2]);
     say!("scene        {}: {}", scene.name, scene.description);
@@ -183,6 +194,19 @@ fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoi
             way.period_s(),
             triple(start, 1),
             triple(end, 1)
+        );
+    }
+    if let Some(b) = breath {
+        let signal = String::from(scene.breathing.signal.clone());
+        say!(
+            "breathing    {} fields of {} × {} × {} nodes led by `{signal}`; up to {:.1} mm; nodes cost {:.1e} mm, storage {:.1e} mm",
+            b.fields,
+            b.size[0],
+            b.size[1],
+            b.size[2],
+            b.longest_mm,
+            b.spacing_error_mm,
+            b.storage_error_mm
         );
     }
     say!("\nprocesses");
@@ -212,7 +236,7 @@ fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoi
     }
 }
 
-fn json_of(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoints>, memory: &Memory) -> Value {
+fn json_of(scene: &Scene, patient: &Patient, plan: &Plan, breath: Option<&Prepared>, way: Option<&Waypoints>, memory: &Memory) -> Value {
     let grid = &patient.info().grid;
     let knob = |(knob, value): &(&Knob, f64)| {
         let range = limits::limit(knob.name).map(|l| [l.low, l.high]);
@@ -231,6 +255,11 @@ fn json_of(scene: &Scene, patient: &Patient, plan: &Plan, way: Option<&Waypoints
         "accuracy": scene.accuracy.name(),
         "volume": { "source": patient.name(), "size": grid.size, "spacing": grid.spacing, "bricks": plan.bricks },
         "tool": tool,
+        "breathing": breath.map(|b| json!({
+            "signal": String::from(scene.breathing.signal.clone()), "fields": b.fields, "size": b.size, "longest_mm": b.longest_mm,
+            "spacing_error_mm": b.spacing_error_mm, "storage_error_mm": b.storage_error_mm,
+            "bytes": b.segments().iter().map(|(_, _, bytes)| bytes).sum::<u64>(),
+        })),
         "processes": plan.processes.iter().map(|p| json!({
             "name": p.process.name(), "rate_hz": p.rate_hz, "threads": p.threads,
             "stages": p.stages.iter().map(|s| json!({ "name": s.name, "per": s.per.name() })).collect::<Vec<_>>(),

@@ -17,6 +17,9 @@ pub struct Args {
     /// Volume to use in place of the scene's own: NRRD, MHA, NIfTI, a DICOM file or directory
     #[arg(long, value_name = "FILE")]
     volume: Option<PathBuf>,
+    /// Motion model to use in place of the scene's own, in a scene that breathes
+    #[arg(long, value_name = "MODEL")]
+    motion: Option<PathBuf>,
     /// Start no console: no page, no port
     #[arg(long)]
     headless: bool,
@@ -39,6 +42,7 @@ pub fn run(args: &Args) -> Outcome {
     let options = RunOptions {
         scene: args.scene.clone(),
         volume: args.volume.clone(),
+        motion: args.motion.clone(),
         headless: args.headless,
         duration: args.duration,
         report: args.report.clone(),

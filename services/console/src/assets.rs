@@ -29,6 +29,7 @@ pub static FILES: &[Asset] = &[
     asset!("/tool.js", "tool.js", "text/javascript; charset=utf-8"),
     asset!("/picture.js", "picture.js", "text/javascript; charset=utf-8"),
     asset!("/transfer.js", "transfer.js", "text/javascript; charset=utf-8"),
+    asset!("/breath.js", "breath.js", "text/javascript; charset=utf-8"),
     asset!("/charts.js", "charts.js", "text/javascript; charset=utf-8"),
     asset!("/services.js", "services.js", "text/javascript; charset=utf-8"),
 ];

@@ -93,7 +93,10 @@ mod tests {
         let rect = |offset, width, height| ViewRect { offset, width, height };
         let views = [rect(0, 32, 24), rect(2304, 16, 8), rect(2688, 16, 8), rect(0, 0, 0)];
         let stamp = Stamp { time_ns: 2_500_000_000, sequence: 7, incarnation: 1 };
-        (FrameHeader { stamp, epoch: 5, view_sequence: 3, render_ns: 4_000_000, views }, (0..3072u32).map(|i| (i % 251) as u8).collect())
+        (
+            FrameHeader { stamp, epoch: 5, view_sequence: 3, render_ns: 4_000_000, shown_ns: 0, views },
+            (0..3072u32).map(|i| (i % 251) as u8).collect(),
+        )
     }
 
     #[test]

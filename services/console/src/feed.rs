@@ -2,7 +2,8 @@
 //!
 //! A feed lives on one thread (iceoryx2's ports may not leave theirs) and never waits.
 
-use maille_contract::{Commit, FrameHeader, Stamp, ToolCommand, ToolState, ViewState, messages::TRANSFER_POINTS};
+use maille_breathing::Signal;
+use maille_contract::{BreathState, Commit, FrameHeader, Stamp, ToolCommand, ToolState, ViewState, messages::TRANSFER_POINTS};
 use serde::Serialize;
 
 /// What the page is told once.
@@ -32,6 +33,8 @@ pub struct Facts {
     pub transfer_points: Vec<[f64; 5]>,
     /// whether the scene has a tool
     pub has_tool: bool,
+    /// name of the breathing's signal, where the patient breathes
+    pub breathing: Option<String>,
 }
 
 /// One service, as its cell in the control block shows it.
@@ -85,6 +88,10 @@ pub trait Feed {
     fn send_view(&mut self, view: &ViewState);
     /// Tells the haptic process where the hand is.
     fn send_command(&mut self, command: &ToolCommand);
+    /// The signal of a patient who breathes, with the last command; `None` where nobody does.
+    fn breath(&mut self) -> Option<&mut Signal>;
+    /// Tells all how breathing is led.
+    fn send_breath(&mut self, state: &BreathState);
     /// Says that the console is alive, how many frames it sent and how many requests it has refused.
     fn beat(&mut self, frames: u64, refused: u64);
     /// Whether the console should end.

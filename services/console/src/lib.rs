@@ -15,6 +15,7 @@
 #![forbid(unsafe_code)]
 
 mod assets;
+pub mod breath;
 mod encode;
 pub mod feed;
 mod hub;
@@ -42,6 +43,8 @@ pub enum ConsoleError {
     Transport(#[from] maille_transport::TransportError),
     #[error("the scene of this run cannot be read: {0}")]
     Scene(String),
+    #[error(transparent)]
+    Breathing(#[from] maille_breathing::BreathingError),
     #[error("the volume of this run cannot be read: {0}")]
     Store(String),
 }

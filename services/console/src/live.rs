@@ -7,8 +7,9 @@ use crate::{
     feed::{Facts, Feed, ServiceStatus, default_view},
     presets,
 };
+use maille_breathing::Signal;
 use maille_contract::{
-    Commit, FrameHeader, Role, ServiceCell, ServiceState, ToolCommand, ToolState, ViewState,
+    BreathState, Commit, FrameHeader, Role, ServiceCell, ServiceState, ToolCommand, ToolState, ViewState,
     control::{Counter, HEARTBEAT_LATE_NS},
 };
 use maille_raycast::{Preset, Transfer};
@@ -42,6 +43,8 @@ pub fn run(domain: &str) -> Result<(), ConsoleError> {
 struct Live {
     life: Life,
     facts: Facts,
+    /// of a patient who breathes
+    signal: Option<Signal>,
     first_view: ViewState,
     frames: FrameSubscriber,
     tool_states: Subscriber<ToolState>,
@@ -63,6 +66,7 @@ impl Live {
         let node = Node::open(domain, Role::Console.word())?;
         let grid = maille_store::volume_info(domain).map_err(|e| ConsoleError::Store(e.to_string()))?.grid;
         let box_mm = BoxMm::of(&grid);
+        let signal = Signal::open(domain, scene)?;
         let facts = Facts {
             scene: scene.name.clone(),
             description: scene.description.clone(),
@@ -76,12 +80,14 @@ impl Live {
             transfer: scene.rendering.transfer.clone(),
             transfer_points: transfer(&scene.rendering.transfer).map(|t| presets::points(&t)).unwrap_or_default(),
             has_tool: scene.tool.is_some(),
+            breathing: signal.is_some().then(|| scene.breathing.signal.clone().into()),
         };
         // what the last console said, or the supervisor before the first
         let told = life.control().view.load::<ViewState>().and_then(|(view, _)| view.checked());
         Ok(Self {
             first_view: told.unwrap_or_else(|| scene_view(scene, &box_mm)),
             facts,
+            signal,
             frames: node.frame_subscriber()?,
             tool_states: node.subscriber()?,
             commits: node.subscriber()?,
@@ -177,6 +183,17 @@ impl Feed for Live {
     fn send_command(&mut self, command: &ToolCommand) {
         self.life.control().command.store(command);
         let _ = self.commands.send(command);
+    }
+
+    fn breath(&mut self) -> Option<&mut Signal> {
+        let signal = self.signal.as_mut()?;
+        // what the console before this one said
+        signal.listen(self.life.control());
+        Some(signal)
+    }
+
+    fn send_breath(&mut self, state: &BreathState) {
+        self.life.control().breath.store(state);
     }
 
     fn beat(&mut self, frames: u64, refused: u64) {

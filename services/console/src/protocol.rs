@@ -5,6 +5,7 @@
 //! - `{"type":"view", …}`: any of the fields of [`ViewPatch`]; what is not named stays as it is;
 //! - `{"type":"tool","taken":true,"target_mm":[x,y,z]}` while the hand holds the tool, at least every 250 ms;
 //!   `{"type":"tool","taken":false}` lets it go;
+//! - `{"type":"breath","held":true,"level":0.4}`: the breath is held or goes on, and the slider leads it or (`null`) nobody does;
 //! - `{"type":"ack","frame":n}` after frame n has been drawn: the next one is sent only then.
 //!
 //! **Server → page**, JSON text: one [`Hello`] first (and again when the patient or the scene changes), then a [`State`] twenty
@@ -47,6 +48,8 @@ pub enum Request {
     View(Box<ViewPatch>),
     /// take, move or let go the tool
     Tool(ToolRequest),
+    /// hold, lead or let go the breath
+    Breath(BreathRequest),
     /// a frame was drawn
     Ack {
         /// its number
@@ -111,6 +114,16 @@ pub struct ToolRequest {
     /// where the hand wants the tip \[mm\]; needed while it is held
     #[serde(default)]
     pub target_mm: Option<[f64; 3]>,
+}
+
+/// The hand on the breath.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BreathRequest {
+    /// whether the breath is held
+    pub held: bool,
+    /// the level that the slider asks for while it leads
+    pub level: Option<f64>,
 }
 
 /// What does not change while the run lasts.
@@ -188,6 +201,8 @@ pub struct State<'a> {
     pub rates: crate::rates::Rates,
     /// the last commit
     pub commit: Option<CommitSummary>,
+    /// how the patient breathes, where one does
+    pub breath: Option<crate::breath::Breath>,
     /// requests refused since the start
     pub refused: u64,
     /// pages connected

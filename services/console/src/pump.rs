@@ -5,6 +5,7 @@
 //! browser never keeps pressing.
 
 use crate::{
+    breath::{self, Desk},
     encode::PictureEncoder,
     feed::{Feed, ServiceStatus},
     hub::{Event, Hub, PageId},
@@ -42,6 +43,7 @@ pub struct Pump<F: Feed> {
     view: ViewState,
     command_sequence: u64,
     holder: Option<Holder>,
+    desk: Desk,
     tool: Option<ToolState>,
     commit: Option<Commit>,
     force: Vec<[f64; 2]>,
@@ -73,6 +75,7 @@ impl<F: Feed> Pump<F> {
             view,
             command_sequence: 0,
             holder: None,
+            desk: Desk::default(),
             tool: None,
             commit: None,
             force: Vec::with_capacity(FORCE_SAMPLES),
@@ -103,6 +106,7 @@ impl<F: Feed> Pump<F> {
         if self.holder.as_ref().is_some_and(|h| now.saturating_sub(h.heard_ns) > HAND_SILENT_NS) {
             self.release();
         }
+        self.desk.serve(&mut self.feed);
         self.take_messages();
         if self.hub.waiting.load(Relaxed) > 0 {
             self.take_frame();
@@ -127,6 +131,12 @@ impl<F: Feed> Pump<F> {
             match event {
                 Event::Request(_, Request::View(patch)) => view_changed |= self.patch_view(&patch),
                 Event::Request(page, Request::Tool(request)) => self.tool_request(page, request, now),
+                Event::Request(_, Request::Breath(request)) => {
+                    let breathes = self.feed.breath().is_some();
+                    if !self.desk.ask(request, breathes) {
+                        self.hub.refuse();
+                    }
+                }
                 Event::Request(_, Request::Ack { .. }) => {}
                 Event::Left(page) if self.holder.as_ref().is_some_and(|h| h.page == page) => self.release(),
                 Event::Left(_) => {}
@@ -215,8 +225,10 @@ impl<F: Feed> Pump<F> {
 
     fn send_state(&mut self) {
         if self.hub.states.receiver_count() > 0 {
+            let time_ns = self.feed.time_ns();
+            let breath = self.feed.breath().map(|signal| breath::seen(signal, time_ns));
             let state = State {
-                time_s: self.feed.time_ns() as f64 * 1e-9,
+                time_s: time_ns as f64 * 1e-9,
                 view: View::from(&self.view),
                 tool: self.tool.as_ref().and_then(tool_seen),
                 held: self.holder.is_some(),
@@ -224,6 +236,7 @@ impl<F: Feed> Pump<F> {
                 services: &self.services,
                 rates: self.rates,
                 commit: self.commit.as_ref().map(commit_seen),
+                breath,
                 refused: self.hub.refused.load(Relaxed),
                 pages: self.hub.pages.load(Relaxed),
             };

@@ -105,7 +105,8 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             let may = engine.respects_tools() || tool.is_none();
             if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && may {
                 last_step = now;
-                let held: Vec<Capsule> = tool.iter().map(|t| Capsule { a: t.tip_mm, b: t.tip_mm, radius_mm: t.radius_mm }).collect();
+                let held: Vec<Capsule> =
+                    tool.iter().map(|t| Capsule { a: t.tip_reference_mm, b: t.tip_reference_mm, radius_mm: t.radius_mm }).collect();
                 let stop = || moves.is_waiting();
                 if let Some(done) = engine.relax(now, 2 * RELAX_NS, &held, &stop, &reader, &mut writer) {
                     announcer.step(&mut life, &done, now, None);

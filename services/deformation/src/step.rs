@@ -176,7 +176,8 @@ impl Engine {
             self.edge = None;
             return None;
         };
-        let edge = [tool.tip_mm, std::array::from_fn(|c| tool.tip_mm[c] - length * tool.direction[c])];
+        let (tip, along) = (tool.tip_reference_mm, tool.direction_reference);
+        let edge = [tip, std::array::from_fn(|c| tip[c] - length * along[c])];
         let distance = |a: [f64; 3], b: [f64; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>().sqrt();
         let before = self.edge.replace(edge)?;
         let moved = distance(before[0], edge[0]).max(distance(before[1], edge[1]));

@@ -3,12 +3,13 @@
 //! The loop samples: the device, the newest commit (a pinned snapshot read in place), the page's commands and the threshold
 //! (latest-value cells), and never waits for any of them. It allocates nothing, takes no lock and makes no blocking
 //! call; what it has to say to others goes through cells to a [`publisher`] thread. When deformation is silent it goes on
-//! with the last committed tissue; when the run ends or the supervisor dies, the force fades to zero first.
+//! with the last committed tissue; in a patient who breathes it feels where that patient lies at this very tick ([`breath`]); when the run ends or the supervisor dies, the force fades to zero first.
 //!
 //! Numerics are `maille-contact`'s; time is simulation time (DESIGN D10).
 
 #![forbid(unsafe_code)]
 
+mod breath;
 mod device;
 mod operator;
 mod outbox;
@@ -37,6 +38,8 @@ pub enum HapticError {
     #[error("this scene has no [tool]: there is nothing for the haptic process to do")]
     NoTool,
     #[error(transparent)]
+    Breathing(#[from] maille_breathing::BreathingError),
+    #[error(transparent)]
     Device(#[from] maille_device::DeviceError),
     #[error("the thread that publishes poses could not start: {0}")]
     Thread(std::io::Error),
@@ -56,7 +59,10 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
     let reader = Reader::open(&domain, Role::Haptic)?;
     let outbox = Arc::new(outbox::Outbox::new());
     let publisher = publisher::start(&domain, &scene, Arc::clone(&outbox), life.incarnation())?;
-    let mut tick = tick::Loop::new(&scene, &reader, outbox, publisher.thread().clone())?;
+    // nothing is mapped, and nothing of it runs, in a scene that does not breathe
+    let mut regions = maille_breathing::Regions::open(&domain, &scene)?;
+    let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
+    let mut tick = tick::Loop::new(&scene, &reader, patient, outbox, publisher.thread().clone())?;
 
     let notices = enter_realtime(scene.haptic.priority.clamp(1, 99) as i32, scene.haptic.cpu);
     for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {
@@ -90,7 +96,7 @@ fn ticks(scene: &Scene, life: &mut Life, tick: &mut tick::Loop<'_>) {
             let cell = life.cell();
             cell.count(Counter::Allocations, allocations);
             cell.count(Counter::Overruns, released.missed);
-            tick.count(cell);
+            tick.count(life.control());
         }
         if let Some(since) = leaving_since
             && (force_n == [0.0; 3] || began - since > LEAVE_NS)

@@ -1,10 +1,11 @@
 //! One tick of the loop: sample, compute, hand over. Bounded work, no allocation, nothing that waits.
 
-use crate::{HapticError, device, operator::Operator, outbox::Outbox, setup};
-use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs};
+use crate::{HapticError, breath::Breather, device, operator::Operator, outbox::Outbox, setup};
+use maille_breathing::Patient;
+use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
-use maille_contract::{ControlBlock, Role, ServiceCell, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
+use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Scene};
 use maille_store::Reader;
 use maille_transport::Life;
@@ -16,6 +17,8 @@ pub(crate) struct Loop<'a> {
     reader: &'a Reader,
     core: HapticCore,
     operator: Operator,
+    /// in a scene that breathes
+    breather: Option<Breather<'a>>,
     threshold_hu: f64,
     view_seen: u64,
     command: Option<ToolCommand>,
@@ -27,11 +30,20 @@ pub(crate) struct Loop<'a> {
     /// the process that moves tissue is dead, starting, or silent
     tissue_stands: bool,
     refused: u64,
+    /// what the last tick's inversion left [mm]; none where none was asked for, or none was found
+    residual_mm: Option<f64>,
+    unmapped: bool,
 }
 
 impl<'a> Loop<'a> {
     /// Sets the loop up; everything that allocates happens here.
-    pub fn new(scene: &Scene, reader: &'a Reader, outbox: Arc<Outbox>, publisher: Thread) -> Result<Self, HapticError> {
+    pub fn new(
+        scene: &Scene,
+        reader: &'a Reader,
+        patient: Option<Patient<'a>>,
+        outbox: Arc<Outbox>,
+        publisher: Thread,
+    ) -> Result<Self, HapticError> {
         let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
         let real = device::kind(tool).map(|kind| device::options(scene).map(|options| (kind, options))).transpose()?;
         let profile = real.as_ref().map(|(kind, options)| maille_device::profile(*kind, options));
@@ -53,6 +65,7 @@ impl<'a> Loop<'a> {
             reader,
             core: HapticCore::new(config),
             operator: Operator::new(tool, way, real),
+            breather: patient.map(Breather::new),
             threshold_hu: scene.deformation.threshold_hu,
             view_seen: 0,
             command: None,
@@ -63,6 +76,8 @@ impl<'a> Loop<'a> {
             last: None,
             tissue_stands: false,
             refused: 0,
+            residual_mm: None,
+            unmapped: false,
         })
     }
 
@@ -70,7 +85,8 @@ impl<'a> Loop<'a> {
     /// through and not taken for something to be freed from first. The force rises from zero all the same.
     pub fn resume(&mut self, control: &ControlBlock) {
         if let Some((last, _)) = control.tool.load::<ToolState>().filter(|(last, _)| last.flags & TOOL_IN_CONTACT != 0) {
-            self.core.resume(last.tip_mm, last.proxy_mm);
+            let (tip_mm, proxy_mm) = self.breather.as_ref().map_or((last.tip_mm, last.proxy_mm), |breather| breather.resume(&last));
+            self.core.resume(tip_mm, proxy_mm);
         }
     }
 
@@ -80,8 +96,11 @@ impl<'a> Loop<'a> {
         let now_ns = control.time_ns(monotonic_ns);
         self.listen(control);
         let said = || control.device.load().map(|(said, _)| said);
-        let (pose, pose_age_s) = self.operator.sample(now_ns, monotonic_ns, self.command.as_ref(), said);
-        if let Some(orientation) = self.operator.orientation() {
+        let (mut pose, pose_age_s) = self.operator.sample(now_ns, monotonic_ns, self.command.as_ref(), said);
+        let (mut orientation, world, vouched) = (self.operator.orientation(), pose.direction, pose.valid);
+        // from here to `leave` everything is of the patient at rest
+        let mut moment = self.breather.as_mut().map(|breather| breather.enter(now_ns, &mut pose, &mut orientation));
+        if let Some(orientation) = orientation {
             self.core.set_orientation(orientation);
         }
         let snapshot = self.reader.snapshot();
@@ -92,20 +111,29 @@ impl<'a> Loop<'a> {
         self.tissue_stands = owner.incarnation.load(Relaxed) > 0
             && (owner.state() != ServiceState::Ready || monotonic_ns.saturating_sub(owner.heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS);
         let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
-        let out = self.core.tick(&inputs);
+        let mut out = self.core.tick_in(&inputs, moment.as_mut().map(|moment| moment as &mut dyn MovingTissue));
+        let tip_reference_mm = out.tip_mm;
+        if let Some(moment) = &moment {
+            moment.leave(&mut out);
+            self.residual_mm = moment.residual_mm;
+            self.unmapped = vouched && moment.residual_mm.is_none();
+        }
         self.operator.write(out.force_n, out.torque_n_mm);
         self.ticks += 1;
         if self.operator.is_external() {
             let incarnation = life.incarnation();
             control.device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence: self.ticks, incarnation, force_n: out.force_n });
         }
-        self.hand_over(control, now_ns, epoch, pose.direction, &out);
+        self.hand_over(control, now_ns, epoch, [world, pose.direction], tip_reference_mm, &out);
         self.last = Some(out);
         out.force_n
     }
 
     /// Takes the latest threshold and the latest command, where there are new ones.
     fn listen(&mut self, control: &ControlBlock) {
+        if let Some(breather) = &mut self.breather {
+            self.refused += u64::from(!breather.listen(control));
+        }
         if control.view.generation() != self.view_seen
             && let Some((view, generation)) = control.view.load::<ViewState>()
         {
@@ -124,7 +152,16 @@ impl<'a> Loop<'a> {
         }
     }
 
-    fn hand_over(&self, control: &ControlBlock, time_ns: u64, epoch: u64, direction: [f64; 3], out: &TickOutputs) {
+    /// Tells what was felt; `directions` are the tool's in world and in reference space.
+    fn hand_over(
+        &self,
+        control: &ControlBlock,
+        time_ns: u64,
+        epoch: u64,
+        [direction, direction_reference]: [[f64; 3]; 2],
+        tip_reference_mm: [f64; 3],
+        out: &TickOutputs,
+    ) {
         let flag = |on: bool, bit: u64| if on { bit } else { 0 };
         let stamp = Stamp { time_ns, sequence: self.ticks, incarnation: 0 };
         let state = ToolState {
@@ -140,6 +177,8 @@ impl<'a> Loop<'a> {
                 | flag(out.fading, TOOL_FADING)
                 | flag(self.tissue_stands, TOOL_TISSUE_STANDS),
             epoch,
+            tip_reference_mm,
+            direction_reference,
         };
         control.tool.store(&state);
         self.outbox.state.store(&state);
@@ -160,7 +199,14 @@ impl<'a> Loop<'a> {
     }
 
     /// Counts what the last tick was like.
-    pub fn count(&mut self, cell: &ServiceCell) {
+    pub fn count(&mut self, control: &ControlBlock) {
+        let cell = control.service(Role::Haptic);
+        if self.breather.is_some() {
+            cell.count(Counter::Unmapped, u64::from(self.unmapped));
+            if let Some(residual_mm) = self.residual_mm {
+                control.inversion.record((residual_mm * 1e6) as u64);
+            }
+        }
         if let Some(out) = &self.last {
             cell.count(Counter::InContact, u64::from(out.in_contact));
             cell.count(Counter::Degraded, u64::from(out.fading));

@@ -1,8 +1,8 @@
 //! A frame: four views drawn, then laid side by side in one sample.
 
 use crate::{overlay, view::View};
-use maille_contract::{FrameHeader, Stamp, ToolState, messages::ViewRect};
-use maille_raycast::{Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, render_extra, section_with};
+use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
+use maille_raycast::{Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Warp, render_extra, section_with};
 use maille_scene::Scene;
 use maille_volume::BrickSource;
 
@@ -28,8 +28,16 @@ impl Composer {
         self.pictures.iter().map(|p| p.rgb.len()).sum()
     }
 
-    /// Draws all views from one source. The tool is where views look; it is drawn while somebody holds it.
-    pub fn draw(&mut self, source: &impl BrickSource, view: &View, tool: Option<&ToolState>, held: bool) -> Result<(), RenderError> {
+    /// Draws all views from one source, through a warp where the patient breathes. The tool is where views look; it is drawn while somebody
+    /// holds it, in the world, where the hand has it.
+    pub fn draw(
+        &mut self,
+        source: &impl BrickSource,
+        warp: Option<&Warp>,
+        view: &View,
+        tool: Option<&ToolState>,
+        held: bool,
+    ) -> Result<(), RenderError> {
         let (camera, at_tip) = view.camera(tool);
         let settings = view.settings(at_tip);
         let skip = match &mut self.skip {
@@ -43,21 +51,20 @@ impl Composer {
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let bodies = Geometry { capsules: tool_body.as_slice(), meshes: &[] };
         // an endoscope does not see itself
-        let extras = Extras { geometry: Some(&bodies).filter(|_| !at_tip), ..Extras::default() };
+        let extras = Extras { warp, geometry: Some(&bodies).filter(|_| !at_tip), ..Extras::default() };
         render_extra(&extras, source, skip, &camera, &settings, whole)?;
         let [level, window] = view.window_hu();
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
-            let outlines = Overlay { geometry: Some(&bodies), ..Overlay::default() };
-            section_with(source, &Section { level, window, ..whole }, &outlines, picture);
+            let overlay = Overlay { warp, geometry: Some(&bodies), ..Overlay::default() };
+            section_with(source, &Section { level, window, ..whole }, &overlay, picture);
         }
         Ok(())
     }
 
     /// Copies the pictures into a sample and says where they lie.
-    pub fn write(&self, pixels: &mut [u8], stamp: Stamp, epoch: u64, view_sequence: u64, render_ns: u64) -> FrameHeader {
-        let mut header = FrameHeader { stamp, epoch, view_sequence, render_ns, ..FrameHeader::default() };
+    pub fn write(&self, pixels: &mut [u8], mut header: FrameHeader) -> FrameHeader {
         let mut offset = 0;
         for (picture, rect) in self.pictures.iter().zip(&mut header.views) {
             let end = offset + picture.rgb.len();

@@ -3,17 +3,18 @@
 //! At the scene's rate it looks whether anything that is seen has changed (epoch, view, tool); if so it pins a snapshot, brings
 //! the map of empty space up to date for the bricks whose versions changed, draws the views and publishes them as one
 //! loaned sample. The pin is held for one frame. When nothing changes a frame goes out twice a second, so that a page
-//! that joins sees something.
+//! that joins sees something. A patient who breathes is drawn through the warp of the frame's simulation time ([`breath`]).
 
 #![forbid(unsafe_code)]
 
+mod breath;
 mod compose;
 #[cfg(test)]
 mod in_place;
 mod overlay;
 mod view;
 
-use maille_contract::{Role, ToolState, control::Counter};
+use maille_contract::{FrameHeader, Role, ToolState, control::Counter};
 use maille_scene::{BoxMm, Machine, Scene};
 use maille_store::Reader;
 use maille_transport::{Domain, Life, Node, monotonic_ns};
@@ -28,6 +29,8 @@ pub enum RenderingError {
     Transport(#[from] maille_transport::TransportError),
     #[error(transparent)]
     Store(#[from] maille_store::StoreError),
+    #[error(transparent)]
+    Breathing(#[from] maille_breathing::BreathingError),
     #[error("the scene of this run cannot be read: {0}")]
     Scene(String),
     #[error("the transfer function `{name}` cannot be used: {reason}")]
@@ -50,6 +53,9 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     let mut life = Life::begin(&domain, Role::Rendering)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| RenderingError::Scene(e.to_string()))?;
     let reader = Reader::open(&domain, Role::Rendering)?;
+    // nothing is mapped, and nothing of it runs, in a scene that does not breathe
+    let mut regions = maille_breathing::Regions::open(&domain, &scene)?;
+    let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
     let node = Node::open(&domain, "rendering")?;
     let mut composer = compose::Composer::new(&scene);
     let frames = node.frame_publisher(composer.bytes())?;
@@ -58,10 +64,12 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     let threads = plan.process(maille_scene::Process::Rendering).map_or(1, |p| p.threads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|n| format!("rays-{n}")).build()?;
     let mut view = view::View::new(&scene, &BoxMm::of(&reader.info().grid))?;
+    let tolerance_mm = scene.breathing.picture_tolerance_mm;
+    let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm)));
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
-    let mut shown: Option<(u64, u64, Option<[f64; 3]>, bool)> = None;
+    let mut shown = None;
     loop {
         let now = monotonic_ns();
         if !life.beat(now) {
@@ -77,13 +85,22 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         }
         let tool = life.control().tool.load::<ToolState>().map(|(tool, _)| tool);
         let held = life.control().held_tool(now).is_some();
-        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), held);
+        if breather.as_mut().is_some_and(|breather| !breather.listen(life.control())) {
+            life.cell().count(Counter::Refused, 1);
+        }
+        // a patient who breathes is another one in every frame
+        let time_ns = life.control().time_ns(now);
+        let moment = breather.as_ref().map_or(0, |_| time_ns);
+        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), held, moment);
         if shown == Some(seen) && now - last_sent_ns < STILL_NS {
             continue;
         }
         shown = Some(seen);
         let snapshot = reader.snapshot();
-        let drawn = pool.install(|| composer.draw(&snapshot, &view, tool.as_ref(), held));
+        let drawn = pool.install(|| {
+            let warp = breather.as_mut().map(|breather| breather.go(time_ns));
+            composer.draw(&snapshot, warp, &view, tool.as_ref(), held)
+        });
         let render_ns = monotonic_ns() - now;
         let epoch = snapshot.epoch();
         drop(snapshot);
@@ -96,7 +113,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         sent += 1;
         let stamp = life.stamp(sent);
         let bytes = composer.bytes();
-        match frames.send(bytes, |pixels| composer.write(pixels, stamp, epoch, view.sequence(), render_ns)) {
+        let header = FrameHeader { stamp, epoch, view_sequence: view.sequence(), render_ns, shown_ns: time_ns, ..FrameHeader::default() };
+        match frames.send(bytes, |pixels| composer.write(pixels, header)) {
             Ok(()) => {
                 life.cell().count(Counter::Sent, 1);
                 life.cell().count(Counter::BytesSent, bytes as u64);
@@ -105,6 +123,11 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
             Err(_) => life.cell().count(Counter::Deferred, 1),
         }
         last_sent_ns = now;
-        life.record(now, monotonic_ns() - now, None);
+        if life.record(now, monotonic_ns() - now, None)
+            && let Some(report) = breather.as_ref().map(breath::Breather::report)
+        {
+            life.control().warp.record((f64::from(report.error_mm) * 1e6) as u64);
+            life.cell().count(Counter::Failures, report.unsettled as u64);
+        }
     }
 }

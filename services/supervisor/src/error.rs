@@ -12,6 +12,9 @@ pub enum SupervisorError {
     /// a fault in the scene, with its line
     #[error(transparent)]
     Scene(#[from] SceneError),
+    /// the patient cannot breathe as the scene asks
+    #[error(transparent)]
+    Breathing(#[from] maille_breathing::BreathingError),
     /// the volume cannot be read
     #[error(transparent)]
     Volume(#[from] ReadError),

@@ -64,6 +64,8 @@ pub struct RunOptions {
     pub scene: Option<PathBuf>,
     /// volume in place of the scene's own
     pub volume: Option<PathBuf>,
+    /// motion model in place of the scene's own
+    pub motion: Option<PathBuf>,
     /// no console
     pub headless: bool,
     /// end by itself after this time
@@ -90,6 +92,9 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     if let Some(device) = &options.device {
         scene.use_device(device.clone())?;
     }
+    if let Some(motion) = &options.motion {
+        scene.use_motion(motion.clone())?;
+    }
     scene.console.enabled &= !options.headless;
     for removed in stale::clean_dead_runs()? {
         say!("{removed}");
@@ -97,16 +102,20 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
 
     let source = scene.volume.source();
     let names = RunReport { scene: scene.name.clone(), volume: patient::name(&source), ..RunReport::default() };
-    let Some(patient) = patient::load(&source, &mut signals)? else {
+    let loaded = match patient::load(&source, &mut signals)? {
+        Some(patient) => patient::breath(&scene, &patient.0.info.grid, &mut signals)?.map(|breath| (patient, breath)),
+        None => None,
+    };
+    let Some((patient, breath)) = loaded else {
         let ended_by = signals.received().unwrap_or("signal").to_owned();
         return finish(RunReport { ended_by, ..names }, options);
     };
     for notice in &patient.1 {
         eprintln!("maille: {notice}");
     }
-    let mut simulation = Simulation::create(scene, &patient, &options.by_hand)?;
+    let mut simulation = Simulation::create(scene, &patient, breath.as_ref(), &options.by_hand)?;
     say!("domain       {}", simulation.domain());
-    drop(patient);
+    drop((patient, breath));
 
     simulation.begin();
     for role in &options.by_hand {

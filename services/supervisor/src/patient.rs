@@ -4,9 +4,10 @@
 
 use crate::{SupervisorError, signals::Signals};
 use indicatif::{ProgressBar, ProgressStyle};
+use maille_breathing::Prepared;
 use maille_phantom::{Kind, Phantom};
-use maille_scene::{PhantomKind, VolumeSource};
-use maille_volume::{Volume, io};
+use maille_scene::{PhantomKind, Scene, VolumeSource};
+use maille_volume::{Grid, Volume, io};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use std::{
     io::IsTerminal as _,
@@ -69,10 +70,27 @@ pub fn load(source: &VolumeSource, signals: &mut Signals) -> Result<Option<Patie
         VolumeSource::File(path) => format!("reading {}", path.display()),
         VolumeSource::Phantom { kind, size, .. } => format!("making the {} of {} × {} × {} voxels", word(*kind), size[0], size[1], size[2]),
     };
-    let work = std::thread::Builder::new().name("maille-load".into()).spawn({
-        let source = source.clone();
-        move || make(&source)
-    });
+    let source = source.clone();
+    beside(what, signals, move || make(&source))
+}
+
+/// What the patient needs to breathe, and nothing where the scene does not call for it; `None` when a signal came first.
+#[allow(clippy::option_option)] // whether it was made, and whether there was anything to make
+pub fn breath(scene: &Scene, grid: &Grid, signals: &mut Signals) -> Result<Option<Option<Prepared>>, SupervisorError> {
+    if !scene.has_effect(maille_breathing::EFFECT) {
+        return Ok(Some(None));
+    }
+    let (scene, grid) = (scene.clone(), grid.clone());
+    beside("making the fields of breathing".into(), signals, move || Ok(maille_breathing::prepare(&scene, &grid)?))
+}
+
+/// Does work on a thread of its own, with progress; `None` when a signal came first.
+fn beside<T: Send + 'static>(
+    what: String,
+    signals: &mut Signals,
+    work: impl FnOnce() -> Result<T, SupervisorError> + Send + 'static,
+) -> Result<Option<T>, SupervisorError> {
+    let work = std::thread::Builder::new().name("maille-load".into()).spawn(work);
     let work = work.map_err(SupervisorError::io("no thread can be started to load the volume"))?;
     let mut progress = Progress::of(what);
     while !work.is_finished() {
@@ -86,7 +104,7 @@ pub fn load(source: &VolumeSource, signals: &mut Signals) -> Result<Option<Patie
     }
     drop(progress);
     match work.join() {
-        Ok(patient) => patient.map(Some),
+        Ok(made) => made.map(Some),
         Err(panic) => std::panic::resume_unwind(panic),
     }
 }

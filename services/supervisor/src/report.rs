@@ -19,10 +19,12 @@
 //! | `services.haptic.tick_histogram`, `lateness_histogram` | the same as pairs: up to so many µs (null: more than all), how many ticks |
 //! | `services.haptic.ticks`, `contact_share` | ticks after warm-up; part of them in contact |
 //! | `services.haptic.in_contact`, `degraded`, `tissue_stood`, `allocations`, `realtime` | ticks in contact; ticks with the force fading; ticks on tissue as last committed while deformation was away; allocations in ticks; whether real-time rights were had |
+//! | `services.haptic.inversion` | in a scene that breathes: `ticks` whose position was carried to the patient at rest, `failures` without a rest position (force faded), `residual_mm` of all: `p50`, `p99`, `p999`, `max` |
 //! | `services.deformation.commits`, `moved_elements` | transactions; elements moved, summed over them |
 //! | `services.deformation.step_us` | from a tool move to its commit |
 //! | `services.deformation.tool_moves`, `deferred`, `refused`, `inversion_failures` | moves received; commits put off for want of a slot; messages that could not be used; voxels given their nearest answer |
 //! | `services.rendering.frames`, `rate_hz`, `frame_ms` | frames after warm-up; a second; time of one |
+//! | `services.rendering.warp` | in a scene that breathes: `unsettled` nodes of all frames' warps, `error_mm`, the bound on the error of a frame's rest positions: `p50`, `p99`, `p999`, `max` |
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
@@ -30,7 +32,7 @@
 
 use crate::{memory::MIB, watch::Post};
 use maille_contract::{
-    ControlBlock, Role, ServiceCell,
+    ControlBlock, Role,
     control::Counter,
     histogram::{Percentiles, SharedHistogram, lower},
 };
@@ -72,6 +74,23 @@ fn histogram(of: &SharedHistogram) -> Histogram {
     rows
 }
 
+/// How well world and rest were brought together by the ticks of a run.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct InversionReport {
+    pub ticks: u64,
+    pub failures: u64,
+    pub residual_mm: Durations,
+}
+
+/// The same for frames.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct WarpReport {
+    pub unsettled: u64,
+    pub error_mm: Durations,
+}
+
 /// Of the haptic process.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -90,6 +109,8 @@ pub struct HapticReport {
     pub tissue_stood: u64,
     pub allocations: u64,
     pub realtime: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub inversion: Option<InversionReport>,
 }
 
 /// Of the deformation process.
@@ -112,6 +133,8 @@ pub struct RenderingReport {
     pub frames: u64,
     pub rate_hz: f64,
     pub frame_ms: Durations,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub warp: Option<WarpReport>,
 }
 
 /// What only one kind of service has.
@@ -174,12 +197,13 @@ impl ServiceReport {
             private_peak_mib: post.private_peak_mib,
             stalls: post.stalls,
             killed,
-            own: own(post.role, cell),
+            own: own(post.role, control),
         }
     }
 }
 
-fn own(role: Role, cell: &ServiceCell) -> Own {
+fn own(role: Role, control: &ControlBlock) -> Own {
+    let cell = control.service(role);
     let n = |counter| cell.counter(counter);
     let seconds = n(Counter::RecordedNs) as f64 * 1e-9;
     let rate_hz = if seconds > 0.0 { n(Counter::Iterations) as f64 / seconds } else { 0.0 };
@@ -198,6 +222,12 @@ fn own(role: Role, cell: &ServiceCell) -> Own {
             tissue_stood: n(Counter::TissueStands),
             allocations: n(Counter::Allocations),
             realtime: n(Counter::NotRealtime) == 0,
+            // nanometres in place of nanoseconds
+            inversion: breathes(&control.inversion, n(Counter::Unmapped)).map(|ticks| InversionReport {
+                ticks,
+                failures: n(Counter::Unmapped),
+                residual_mm: Durations::of(&control.inversion, 1e6),
+            }),
         }),
         Role::Deformation => Own::Deformation(DeformationReport {
             commits: n(Counter::Commits),
@@ -208,11 +238,20 @@ fn own(role: Role, cell: &ServiceCell) -> Own {
             refused: n(Counter::Refused),
             inversion_failures: n(Counter::Failures),
         }),
-        Role::Rendering => {
-            Own::Rendering(RenderingReport { frames: n(Counter::Iterations), rate_hz, frame_ms: Durations::of(&cell.duration, 1e6) })
-        }
+        Role::Rendering => Own::Rendering(RenderingReport {
+            frames: n(Counter::Iterations),
+            rate_hz,
+            frame_ms: Durations::of(&cell.duration, 1e6),
+            warp: breathes(&control.warp, 0)
+                .map(|_| WarpReport { unsettled: n(Counter::Failures), error_mm: Durations::of(&control.warp, 1e6) }),
+        }),
         Role::Console => Own::Console {},
     }
+}
+
+/// How many inversions were counted, failures included; none in a scene that does not breathe.
+fn breathes(of: &SharedHistogram, failures: u64) -> Option<u64> {
+    Some(of.percentiles().count + failures).filter(|&count| count > 0)
 }
 
 impl StoreReport {
@@ -261,6 +300,18 @@ impl fmt::Display for RunReport {
                 Own::Deformation(d) => writeln!(f, "{:<24} {}", "deformation step µs", row(&d.step_us))?,
                 Own::Rendering(r) => writeln!(f, "{:<24} {}", "rendering frame ms", row(&r.frame_ms))?,
                 Own::Console {} => {}
+            }
+        }
+        let small = |d: &Durations| format!("{:>9.1e} {:>9.1e} {:>9.1e} {:>9.1e}", d.p50, d.p99, d.p999, d.max);
+        for s in self.services.values() {
+            match &s.own {
+                Own::Haptic(HapticReport { inversion: Some(i), .. }) => {
+                    writeln!(f, "{:<24} {}  {} ticks without", "rest position mm", small(&i.residual_mm), i.failures)?;
+                }
+                Own::Rendering(RenderingReport { warp: Some(w), .. }) => {
+                    writeln!(f, "{:<24} {}  {} nodes without", "picture's rest mm", small(&w.error_mm), w.unsettled)?;
+                }
+                _ => {}
             }
         }
         if let Some(Own::Haptic(h)) = self.services.get(Role::Haptic.word()).map(|s| &s.own) {

@@ -10,13 +10,14 @@ use crate::{
     report::{RunReport, ServiceReport, StoreReport},
     watch::{Post, Watch, end_all},
 };
+use maille_breathing::Prepared;
 use maille_contract::{
     Role, RunState, Stamp, ViewState,
     clock::{REAL_TIME_PPM, SimulationClock},
     messages::TRANSFER_POINTS,
 };
 use maille_scene::{
-    BoxMm, CameraKind, Mode, Process, Scene,
+    BoxMm, CameraKind, Mode, Process, Scene, Signal,
     plan::{Machine, Plan, plan},
 };
 use maille_store::{StoreKeeper, StorePlan, StoreSizes};
@@ -69,24 +70,28 @@ pub fn plan_of(scene: &Scene, volume: &Volume) -> (Plan, StoreSizes) {
 impl Simulation {
     /// Makes all shared memory and all services for a scene on a volume; starts nothing yet. The scene is completed: way
     /// points, camera, threads and absolute paths as the services will read them.
-    pub fn create(mut scene: Scene, (volume, _): &Patient, by_hand: &[Role]) -> Result<Self, SupervisorError> {
+    pub fn create(mut scene: Scene, (volume, _): &Patient, breath: Option<&Prepared>, by_hand: &[Role]) -> Result<Self, SupervisorError> {
         let (plan, sizes) = plan_of(&scene, volume);
         resolve(&mut scene, &plan, volume)?;
         let segments = StorePlan { info: volume.info.clone(), sizes }.segments();
         let frames = frame_pool_bytes(plan.frame_bytes);
-        memory::check_space(segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames)?;
+        let regions: u64 = breath.map_or(0, |breath| breath.segments().iter().map(|(_, _, bytes)| bytes).sum());
+        memory::check_space(segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions)?;
 
         let domain = Files(Domain::fresh()?);
         let control = ControlMap::create(&domain.0)?;
         control.supervisor_pid.store(std::process::id().into(), Relaxed);
         let progress = Mutex::new(Progress::of("laying out the voxels in shared memory"));
-        let store = StoreKeeper::create(&domain.0, volume, sizes, |part| {
+        let mut store = StoreKeeper::create(&domain.0, volume, sizes, |part| {
             // told by many threads: whoever finds the line busy leaves it
             if let Ok(mut progress) = progress.try_lock() {
                 progress.tick(Some(part));
             }
         })?;
         drop(progress);
+        if let Some(breath) = breath {
+            breath.publish(&mut store, &domain.0)?;
+        }
         let path = domain.0.directory().join(SCENE_FILE);
         fs::write(&path, scene.to_toml()).map_err(SupervisorError::io(format!("{} cannot be written", path.display())))?;
         control.view.store(&first_view(&scene, volume));
@@ -200,6 +205,12 @@ fn resolve(scene: &mut Scene, plan: &Plan, volume: &Volume) -> Result<(), Superv
     let absolute = |path: &Path| fs::canonicalize(path).map_err(SupervisorError::io(format!("{} cannot be found", path.display())));
     if let Some(file) = &scene.volume.file {
         scene.volume.file = Some(absolute(file)?);
+    }
+    if let Some(model) = &scene.breathing.model {
+        scene.breathing.model = Some(absolute(model)?);
+    }
+    if let Signal::Recorded(file) = &scene.breathing.signal {
+        scene.breathing.signal = Signal::Recorded(absolute(file)?);
     }
     if Path::new(&scene.rendering.transfer).is_file() {
         scene.rendering.transfer = absolute(Path::new(&scene.rendering.transfer))?.display().to_string();

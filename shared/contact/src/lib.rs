@@ -25,6 +25,7 @@ pub mod device;
 pub mod friction;
 pub mod limits;
 pub mod material;
+pub mod moving;
 mod node;
 pub mod passivity;
 pub mod proxy;

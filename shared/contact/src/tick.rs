@@ -16,6 +16,7 @@ use crate::{
     finite,
     limits::{MAX_JUMP_MM, MAX_NODES, MAX_SEARCHES, MAX_STEP_S},
     material::TissueTable,
+    moving::MovingTissue,
     node::{Circumstances, Node},
     passivity::{Passivity, Port},
     proxy::Contact,
@@ -303,6 +304,15 @@ impl HapticCore {
 
     /// One tick. Allocates nothing; bounded work.
     pub fn tick<S: Surface + ?Sized>(&mut self, inputs: &TickInputs<'_, S>) -> TickOutputs {
+        self.tick_in(inputs, None)
+    }
+
+    /// One tick in tissue that moves by itself: everything in and out is of tissue at rest (`moving`).
+    pub fn tick_in<S: Surface + ?Sized>(
+        &mut self,
+        inputs: &TickInputs<'_, S>,
+        mut moving: Option<&mut (dyn MovingTissue + '_)>,
+    ) -> TickOutputs {
         let dt = self.step_time(inputs.now_ns);
         let mut fading = inputs.release;
         let (x, jumped) = self.accept_pose(&inputs.pose, inputs.pose_age_s, dt, &mut fading);
@@ -330,15 +340,20 @@ impl HapticCore {
         };
         // without tissue the last force is held and faded; without any valid pose there was never one
         if let (Some(tissue), Some(_)) = (inputs.tissue, self.position) {
-            self.touch(tissue, inputs, x, dt, jumped, &mut out);
+            self.touch(tissue, inputs, x, dt, jumped, moving.as_deref_mut(), &mut out);
         }
         // a late tick gets no larger a step: what the hand would feel is one tick's change
         let step = dt.min(self.config.period_s);
+        let given = V3::from(self.shaper.last_n());
         out.force_n = self.shaper.shape(self.last_wanted.into(), step, fading);
         out.torque_n_mm = self.torque_shaper.shape(self.last_torque.into(), step, fading);
         if self.config.passivity && self.position.is_some() {
             // after the limits: a fall that the slew limit would stretch may be more than is stored
-            let force = self.passivity.control(x, V3::from(out.force_n), self.elastic_mj, dt);
+            let port = moving.as_ref().map_or(x, |moving| V3::from(moving.port_mm()));
+            if let Some(moving) = &moving {
+                self.passivity.grant(given.dot(&V3::from(moving.moved_mm())));
+            }
+            let force = self.passivity.control(port, V3::from(out.force_n), self.elastic_mj, dt);
             self.shaper.cut_to(force);
             self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
             (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
@@ -435,7 +450,17 @@ impl HapticCore {
     }
 
     /// Contact of all nodes: force and torque before limits.
-    fn touch<S: Surface + ?Sized>(&mut self, tissue: &S, inputs: &TickInputs<'_, S>, x: V3, dt: f64, jumped: bool, out: &mut TickOutputs) {
+    #[allow(clippy::too_many_arguments)] // a tick of that many things
+    fn touch<S: Surface + ?Sized>(
+        &mut self,
+        tissue: &S,
+        inputs: &TickInputs<'_, S>,
+        x: V3,
+        dt: f64,
+        jumped: bool,
+        mut moving: Option<&mut (dyn MovingTissue + '_)>,
+        out: &mut TickOutputs,
+    ) {
         let committed = self.epoch.replace(inputs.epoch).is_some_and(|last| last != inputs.epoch);
         let threshold = tissue.threshold();
         let other_surface = self.threshold != threshold && !self.threshold.is_nan();
@@ -458,7 +483,10 @@ impl HapticCore {
         let mut deepest: Option<(usize, V3, Contact)> = None;
         self.elastic_mj = 0.0;
         for (n, (node, of)) in self.nodes.iter_mut().zip(shape.nodes()).enumerate() {
-            let arm = rotation * V3::from(of.offset_mm);
+            let mut arm = rotation * V3::from(of.offset_mm);
+            if let Some(moving) = moving.as_deref_mut().filter(|_| of.offset_mm != [0.0; 3]) {
+                arm = finite(moving.place(arm.into())).unwrap_or(arm);
+            }
             let velocity = self.velocity + self.spin.cross(&arm);
             let search = (n + count - self.ticks * MAX_SEARCHES % count) % count < MAX_SEARCHES;
             let felt = node.touch(tissue, x + arm, velocity, search, &now);

@@ -4,6 +4,7 @@
 //! its numbers standing, so that the report counts across restarts.
 
 use crate::{
+    breath::BreathState,
     cell::LatestCell,
     clock::SimulationClock,
     histogram::SharedHistogram,
@@ -17,7 +18,7 @@ use core::sync::atomic::{
 };
 
 /// "maille" and the version of this layout.
-pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille02");
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille03");
 /// Pins in the block.
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
@@ -109,10 +110,12 @@ pub enum Counter {
     Received = 14,
     /// ticks on tissue as it was last committed, because who moves it is dead, starting or silent (haptic)
     TissueStands = 15,
+    /// ticks in which no rest position was found for the device: the last one is kept and the force fades (haptic)
+    Unmapped = 16,
 }
 
 /// Number of counters.
-pub const COUNTERS: usize = 16;
+pub const COUNTERS: usize = 24;
 
 /// One service's life and numbers. Writer: the service, but for `restarts` and `incarnation` (supervisor).
 #[repr(C)]
@@ -202,6 +205,12 @@ pub struct ControlBlock {
     pub device: LatestCell<{ words::<DeviceState>() }>,
     /// a device outside the haptic process: what it shall render. Writer: haptic
     pub device_force: LatestCell<{ words::<DeviceForce>() }>,
+    /// who leads the breath, in a scene that breathes. Writer: console
+    pub breath: LatestCell<{ words::<BreathState>() }>,
+    /// residual of a tick's inversion [nm, in place of ns]. Writer: haptic
+    pub inversion: SharedHistogram,
+    /// bound on the error of a frame's warp [nm, in place of ns]. Writer: rendering
+    pub warp: SharedHistogram,
     /// one for each [`Role`](crate::Role)
     pub services: [ServiceCell; 4],
     /// pins of the store's readers; see [`Role::pins`](crate::Role::pins)

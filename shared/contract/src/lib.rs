@@ -10,6 +10,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod breath;
 pub mod cell;
 pub mod clock;
 pub mod control;
@@ -20,6 +21,7 @@ pub mod names;
 pub mod probe;
 pub mod segment_header;
 
+pub use breath::{BreathLead, BreathState, MotionHeader};
 pub use control::{ControlBlock, RunState, ServiceCell, ServiceState};
 pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 pub use names::Role;

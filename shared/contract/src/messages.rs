@@ -1,7 +1,7 @@
 //! Messages of iceoryx2's publish-subscribe.
 //!
-//! Positions are LPS millimetres in the patient's frame at rest (world = reference until a scene breathes), forces newtons,
-//! times simulation nanoseconds. A receiver treats what arrives as an allegation: `checked()` gives the message back
+//! Positions are LPS millimetres of world space, where device and eye are; those of [`ToolMove`], and what says so, are of reference space,
+//! the patient at rest, where tissue is deformed (the same place until a scene breathes). Forces are newtons, times simulation nanoseconds. A receiver treats what arrives as an allegation: `checked()` gives the message back
 //! only when every number is finite and in range.
 
 use bytemuck::{Pod, Zeroable};
@@ -32,7 +32,7 @@ pub const TOOL_TISSUE_STANDS: u64 = 1 << 3;
 /// Pose and force of the tool. Writer: haptic, a few hundred times a second. Readers: rendering, console.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("maille.ToolState/v1")]
+#[type_name("maille.ToolState/v2")]
 pub struct ToolState {
     /// sender's stamp
     pub stamp: Stamp,
@@ -52,9 +52,13 @@ pub struct ToolState {
     pub flags: u64,
     /// epoch of the tissue that was felt
     pub epoch: u64,
+    /// the tip in reference space: which part of the patient at rest is where the tip is [mm]
+    pub tip_reference_mm: [f64; 3],
+    /// where the tool points, turned with the tissue into reference space, unit
+    pub direction_reference: [f64; 3],
 }
 
-/// The tool has pressed in: tissue should give way. Writer: haptic. Reader: deformation.
+/// The tool has pressed in: tissue should give way. In reference space. Writer: haptic. Reader: deformation.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
 #[type_name("maille.ToolMove/v1")]
@@ -210,7 +214,7 @@ pub struct ViewRect {
 /// User header of a frame. Writer: rendering. Reader: console.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("maille.FrameHeader/v1")]
+#[type_name("maille.FrameHeader/v2")]
 pub struct FrameHeader {
     /// sender's stamp
     pub stamp: Stamp,
@@ -220,6 +224,8 @@ pub struct FrameHeader {
     pub view_sequence: u64,
     /// time spent rendering [ns]
     pub render_ns: u64,
+    /// simulation time of what is shown [ns]: where a patient who breathes lay
+    pub shown_ns: u64,
     /// the views, in the order of [`VIEWS`]; 0 × 0 where the scene has none
     pub views: [ViewRect; 4],
 }

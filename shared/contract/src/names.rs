@@ -67,7 +67,7 @@ pub const PINS_PER_ROLE: usize = 4;
 /// Topics of iceoryx2's publish-subscribe, inside a domain.
 pub mod topic {
     /// [`ToolState`](crate::ToolState), haptic → rendering, console
-    pub const TOOL_STATE: &str = "maille/tool-state/v1";
+    pub const TOOL_STATE: &str = "maille/tool-state/v2";
     /// [`ToolMove`](crate::ToolMove), haptic → deformation
     pub const TOOL_MOVE: &str = "maille/tool-move/v1";
     /// [`Commit`](crate::Commit), deformation → rendering, haptic, console
@@ -77,7 +77,7 @@ pub mod topic {
     /// [`ToolCommand`](crate::ToolCommand), console → haptic
     pub const TOOL_COMMAND: &str = "maille/tool-command/v1";
     /// pixels with [`FrameHeader`](crate::FrameHeader) as user header, rendering → console
-    pub const FRAME: &str = "maille/frame/v1";
+    pub const FRAME: &str = "maille/frame/v2";
     /// [`Ping`](crate::probe::Ping), only in a domain of `maille latency`
     pub const PING: &str = "maille/ping/v1";
     /// [`Pong`](crate::probe::Pong), only in a domain of `maille latency`

@@ -4,7 +4,8 @@
 
 use iceoryx2::prelude::ZeroCopySend;
 use maille_contract::{
-    Commit, ControlBlock, FrameHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState, ViewState,
+    BreathLead, BreathState, Commit, ControlBlock, FrameHeader, MotionHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState,
+    ViewState,
     index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
     probe::{Ping, Pong},
@@ -34,23 +35,26 @@ macro_rules! message {
 #[test]
 fn messages_keep_their_names_sizes_and_offsets() {
     message!(Stamp, "maille.Stamp/v1", 24, time_ns: 0, sequence: 8, incarnation: 16);
-    message!(ToolState, "maille.ToolState/v1", 152, stamp: 0, tip_mm: 24, proxy_mm: 48, direction: 72, force_n: 96, penetration_mm: 120, radius_mm: 128, flags: 136, epoch: 144);
+    message!(ToolState, "maille.ToolState/v2", 200, stamp: 0, tip_mm: 24, proxy_mm: 48, direction: 72, force_n: 96, penetration_mm: 120, radius_mm: 128, flags: 136, epoch: 144, tip_reference_mm: 152, direction_reference: 176);
     message!(ToolMove, "maille.ToolMove/v1", 136, stamp: 0, tip_mm: 24, outside_mm: 48, contact_mm: 72, normal: 96, depth_mm: 120, radius_mm: 128);
     message!(Commit, "maille.Commit/v1", 88, stamp: 0, epoch: 24, cause: 32, moved_elements: 40, bricks: 48, step_ns: 56, refused_mm: 64);
     message!(ViewState, "maille.ViewState/v1", 664, stamp: 0, threshold_hu: 24, mode: 32, camera: 40, eye_mm: 48, target_mm: 72, up: 96, fov_deg: 120, window_center_hu: 128,
         window_width_hu: 136, sections_mm: 144, sections_follow_tool: 168, transfer_count: 176, transfer: 184);
     message!(ToolCommand, "maille.ToolCommand/v1", 64, stamp: 0, taken: 24, target_mm: 32, sent_ns: 56);
     message!(ViewRect, "maille.ViewRect/v1", 16, offset: 0, width: 8, height: 12);
-    message!(FrameHeader, "maille.FrameHeader/v1", 112, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, views: 48);
+    message!(FrameHeader, "maille.FrameHeader/v2", 120, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, shown_ns: 48, views: 56);
     message!(Ping, "maille.Ping/v1", 256, time_ns: 0, sequence: 8, rest: 16);
     message!(Pong, "maille.Pong/v1", 256, time_ns: 0, sequence: 8, rest: 16);
 }
 
 #[test]
 fn shared_words_keep_their_sizes_and_offsets() {
-    golden!(ServiceCell, 18_624, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 176, lateness: 9_400);
+    golden!(ServiceCell, 18_688, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 240, lateness: 9_464);
     golden!(DeviceState, 88, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64);
     golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
+    golden!(BreathLead, 88, since_ns: 0, base_ns: 8, speed: 16, mix: 40, slider: 64);
+    golden!(BreathState, 216, stamp: 0, leads: 24, held: 200, led: 208);
+    golden!(MotionHeader, 16, bytes: 0, storage_error_mm: 8);
     assert_eq!((offset_of!(ControlBlock, magic), align_of::<ControlBlock>()), (0, 64));
     assert_eq!(offset_of!(ControlBlock, size_bytes), 8);
     assert_eq!(offset_of!(ControlBlock, pins) % 64, 0);

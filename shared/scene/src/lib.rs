@@ -10,6 +10,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod breathing;
 mod error;
 pub mod limits;
 mod load;
@@ -23,6 +24,7 @@ pub mod suggest;
 pub mod tissue;
 pub mod tool;
 
+pub use breathing::{Breathing, Signal};
 pub use error::SceneError;
 pub use load::TRANSFER_PRESETS;
 pub use path::{BoxMm, ToolPose, Waypoint, Waypoints};

@@ -4,10 +4,11 @@
 //! each value stands, so that the structs stay plain data and a fault found later still has its place.
 
 use crate::{
+    breathing::Signal,
     error::{Fault, SceneError, Source},
     limits::{LIMITS, range_text},
     registry::{self, CalledBy, KNOBS},
-    scene::{EffectSetting, Scene, Size},
+    scene::{EffectSetting, PhantomKind, Scene, Size},
     suggest,
     tool::{Approach, Device, PROFILES, PathPoint, Shape, ToolKind},
 };
@@ -65,6 +66,12 @@ impl Scene {
             let found = document.find_file("rendering.transfer", &transfer, &folder, "transfer function")?;
             scene.rendering.transfer = found.display().to_string();
         }
+        if let Some(model) = &scene.breathing.model {
+            scene.breathing.model = Some(document.find_file("breathing.model", model, &folder, "motion model")?);
+        }
+        if let Signal::Recorded(file) = &scene.breathing.signal {
+            scene.breathing.signal = Signal::Recorded(document.find_file("breathing.signal", file, &folder, "trace of breathing")?);
+        }
         if let Some(Device::PathFile(file)) = scene.tool.as_ref().map(|t| &t.device) {
             let found = document.find_file("tool.device", file, &folder, "file of way points")?;
             scene.use_device(Device::PathFile(found))?;
@@ -75,6 +82,22 @@ impl Scene {
     /// Reads a scene from text, without looking at any file it names; `name` is for messages.
     pub fn parse(name: &str, text: &str) -> Result<Self, SceneError> {
         read(name, text).map(|(scene, _)| scene)
+    }
+
+    /// Puts another motion model in, as `--motion` does.
+    ///
+    /// # Errors
+    /// When there is no such file, or the scene does not breathe.
+    pub fn use_motion(&mut self, model: PathBuf) -> Result<(), SceneError> {
+        if !model.exists() {
+            return Err(SceneError::sentence(format!("there is no motion model {}", model.display()), None));
+        }
+        if !self.has_effect("breathing") {
+            let help = Some("set `breathing = true` under [effects]".into());
+            return Err(SceneError::sentence("this scene does not call for `breathing`: a motion model would move nothing", help));
+        }
+        self.breathing.model = Some(model);
+        Ok(())
     }
 
     /// Chooses what moves the tool, as `--device` does; reads the way points of `path:FILE`.
@@ -292,6 +315,15 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     if scene.deformation.sampling_order == 2 {
         let help = Some("use 1 (trilinear) or 3 (tricubic)".into());
         faults.push(document.fault("deformation.sampling_order", "there is no interpolation of order 2", "1 or 3", help));
+    }
+    if ![16, 32].contains(&scene.breathing.precision_bits) {
+        let help = Some("use 16 (steps of one size) or 32 (single precision)".into());
+        faults.push(document.fault("breathing.precision_bits", "vectors are kept in 16 or 32 bits", "16 or 32", help));
+    }
+    let made_torso = scene.volume.file.is_none() && scene.volume.phantom == Some(PhantomKind::Torso);
+    if scene.has_effect("breathing") && scene.breathing.model.is_none() && !made_torso {
+        let help = Some("give [breathing] model = \"FILE\" (`maille motion fit` writes one), or the volume phantom = \"torso\"".into());
+        faults.push(document.fault("effects.breathing", "nothing says how this patient breathes", "needs a model", help));
     }
     if scene.volume.file.is_some() && scene.volume.phantom.is_some() {
         let help = Some("keep `file` for a patient of your own, or `phantom` for a made one".into());

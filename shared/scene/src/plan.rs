@@ -83,8 +83,8 @@ pub struct Plan {
     pub panels: Vec<&'static str>,
 }
 
-/// Bytes of the control segment: head, pins, heartbeats, last state.
-const CONTROL_BYTES: u64 = 64 * 1024;
+/// Bytes of the control segment: head, pins, heartbeats, last state, histograms.
+const CONTROL_BYTES: u64 = 100 * 1024;
 
 /// Derives the plan of a scene on a volume of this grid.
 pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
@@ -185,6 +185,11 @@ impl Plan {
     /// Whether displacements are stored.
     pub fn has_displacement(&self) -> bool {
         self.channels.contains(&&DISPLACEMENT)
+    }
+
+    /// Adds a read-only region, whose size only its maker knows.
+    pub fn add_region(&mut self, name: &'static str, meaning: &'static str, bytes: u64) {
+        self.segments.push(SegmentPlan { name, meaning, slots: 0, bytes });
     }
 
     /// Bytes of all segments.

@@ -120,6 +120,8 @@ pub struct Effect {
     pub called_by: CalledBy,
     /// processes that must run
     pub processes: &'static [Process],
+    /// processes that it adds work to where others have them run
+    pub joins: &'static [Process],
     /// store channels that must exist
     pub channels: &'static [&'static Channel],
     /// work that it adds
@@ -146,6 +148,7 @@ impl Effect {
             summary,
             called_by: CalledBy::Effects,
             processes: &[],
+            joins: &[],
             channels: &[],
             stages: &[],
             panels: &[],
@@ -254,9 +257,20 @@ pub static EFFECTS: &[Effect] = &[
         hard_cases: &["sliding across commits", "thin walls", "poses that are no numbers"],
         ..Effect::named("palpation", "a finger or an ultrasound probe (`tool.shape`) feels with several proxies")
     },
+    Effect {
+        processes: &[Process::Rendering],
+        joins: &[Process::Haptic],
+        stages: &[
+            stage(Process::Haptic, "world to reference", Per::Tick),
+            stage(Process::Haptic, "force to world", Per::Tick),
+            stage(Process::Rendering, "warp", Per::Frame),
+        ],
+        panels: &["breathing"],
+        hard_cases: &["a trace with holes", "folded tissue", "beyond the model's grid", "breath held and slid", "restart in mid-breath"],
+        ..Effect::named("breathing", "the patient breathes: seen, felt, and led from the page")
+    },
     Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
-    Effect::later("breathing", "the patient breathes", &[]),
     Effect::later("x-ray", "a fluoroscopic view", &[]),
     Effect::later("ultrasound", "an ultrasound view", &[]),
     Effect::later("surfaces", "meshes extracted live", &[]),
@@ -348,6 +362,50 @@ pub static KNOBS: &[Knob] = &[
         get: |s| s.deformation.sampling_order.into(),
         set: |s, v| s.deformation.sampling_order = v as u32,
     },
+    Knob {
+        name: "breathing.field_spacing_mm",
+        effect: "breathing",
+        summary: "distance of the nodes of the fields of breathing",
+        defaults: [8.0, 5.0, 2.5],
+        error: "difference of the displacement from the model's own [mm]",
+        truth: "the model on its own grid, or its formula",
+        cost: "memory (inverse cube)",
+        get: |s| s.breathing.field_spacing_mm,
+        set: |s, v| s.breathing.field_spacing_mm = v,
+    },
+    Knob {
+        name: "breathing.precision_bits",
+        effect: "breathing",
+        summary: "bits of a component of a stored vector: 16 in steps of one size, 32 single precision",
+        defaults: [16.0, 16.0, 32.0],
+        error: "bound on the error of a stored vector [mm]",
+        truth: "the vector before it is stored",
+        cost: "memory, twice as much for 32",
+        get: |s| s.breathing.precision_bits.into(),
+        set: |s, v| s.breathing.precision_bits = v as u32,
+    },
+    Knob {
+        name: "breathing.inversion_tolerance_mm",
+        effect: "breathing",
+        summary: "residual at which a tick's inversion stops",
+        defaults: [0.01, 0.001, 0.0005],
+        error: "residual |x − X − u(X)| [mm], of every tick, in the report",
+        truth: "analytic fields with a known inverse",
+        cost: "tick time, one or two more evaluations",
+        get: |s| s.breathing.inversion_tolerance_mm,
+        set: |s, v| s.breathing.inversion_tolerance_mm = v,
+    },
+    Knob {
+        name: "breathing.picture_tolerance_mm",
+        effect: "breathing",
+        summary: "error allowed in the rest position of what a picture shows",
+        defaults: [0.3, 0.1, 0.03],
+        error: "bound on the error of a sample's rest position [mm], of every frame, in the report",
+        truth: "the inverse solved at the sample itself",
+        cost: "frame time",
+        get: |s| s.breathing.picture_tolerance_mm,
+        set: |s, v| s.breathing.picture_tolerance_mm = v,
+    },
 ];
 
 #[cfg(test)]
@@ -379,7 +437,7 @@ mod tests {
                 assert!(effect(name).is_some(), "{} depends on {name}", e.name);
             }
             // a stage without its process would never run
-            for s in e.stages.iter().filter(|s| !e.processes.contains(&s.process)) {
+            for s in e.stages.iter().filter(|s| !e.processes.contains(&s.process) && !e.joins.contains(&s.process)) {
                 assert!(
                     e.depends_on.iter().any(|d| effect(d).is_some_and(|d| d.processes.contains(&s.process))),
                     "{}: stage {} has no process",

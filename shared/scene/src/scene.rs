@@ -1,6 +1,7 @@
 //! A scene as it stands in its file: plain data, with what the file leaves out filled in.
 
 use crate::{
+    breathing::Breathing,
     sections::{Console, Deformation, Haptic, Memory, Rendering},
     tissue::{self, Tissue},
     tool::{DeviceSection, Tool},
@@ -154,6 +155,9 @@ pub struct Scene {
     /// where a real device is found; for `tool.device` inverse3, touch and forcedimension
     #[serde(skip_serializing_if = "is_default")]
     pub device: DeviceSection,
+    /// the patient who breathes, for the effect of that name
+    #[serde(skip_serializing_if = "is_default")]
+    pub breathing: Breathing,
     /// ChainMail and the mapper
     pub deformation: Deformation,
     /// loop, contact, limits of the device
@@ -180,6 +184,7 @@ impl Default for Scene {
             volume: VolumeSection::default(),
             tool: None,
             device: DeviceSection::default(),
+            breathing: Breathing::default(),
             deformation: Deformation::default(),
             haptic: Haptic::default(),
             rendering: Rendering::default(),

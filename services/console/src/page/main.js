@@ -8,6 +8,7 @@ import { Mouse } from "/mouse.js";
 import { Tool } from "/tool.js";
 import { Picture } from "/picture.js";
 import { TransferEditor } from "/transfer.js";
+import { Breath } from "/breath.js";
 import { Charts } from "/charts.js";
 import { Services } from "/services.js";
 
@@ -64,7 +65,7 @@ const top = {
   },
 };
 
-model.panels = [top, views, tool, picture, transfer, new Charts(), new Services()];
+model.panels = [top, views, tool, picture, transfer, new Breath(model), new Charts(), new Services()];
 
 model.link = new Link({
   onOpen: () => { model.online = true; model.changed(); },
@@ -101,6 +102,7 @@ addEventListener("keydown", (e) => {
     f: () => model.edit({ sections_follow_tool: !model.view.sections_follow_tool }),
     r: () => mouse.resetCamera(),
     t: () => tool.toggle(),
+    b: () => { if (model.facts.breathing) $("breath-hold").click(); },
     Escape: () => tool.release(),
     "[": () => model.edit({ threshold_hu: model.view.threshold_hu - 10, mode: 1 }),
     "]": () => model.edit({ threshold_hu: model.view.threshold_hu + 10, mode: 1 }),

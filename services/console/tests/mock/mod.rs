@@ -1,9 +1,10 @@
 //! A made run: a head of three ellipsoids, a tool that presses into its side, four services. Nothing but arithmetic; used by
 //! the server's tests and by `examples/mock.rs`.
 
+use maille_breathing::Signal;
 use maille_console::feed::{Facts, Feed, ServiceStatus, default_view};
 use maille_contract::{
-    Commit, FrameHeader, Stamp, ToolCommand, ToolState, ViewState,
+    BreathState, Commit, FrameHeader, Stamp, ToolCommand, ToolState, ViewState,
     messages::{TOOL_IN_CONTACT, TOOL_TAKEN_OVER, ViewRect},
 };
 use std::{
@@ -28,6 +29,8 @@ pub struct Shared {
     pub view: Mutex<Option<ViewState>>,
     /// all commands that were sent
     pub commands: Mutex<Vec<ToolCommand>>,
+    /// all commands to the breath that were sent
+    pub breaths: Mutex<Vec<BreathState>>,
     /// frames taken
     pub frames: AtomicU64,
     /// requests refused, as last told
@@ -42,6 +45,7 @@ pub struct Shared {
 pub struct Mock {
     shared: Arc<Shared>,
     facts: Facts,
+    signal: Signal,
     start: Instant,
     size: [u32; 4],
     next_frame_ns: u64,
@@ -69,12 +73,14 @@ impl Mock {
             transfer: "ct".into(),
             transfer_points: Vec::new(),
             has_tool: true,
+            breathing: Some("synthetic".into()),
         };
         let mut view = default_view(LOW, HIGH);
         view.eye_mm = [260.0, -600.0, 220.0];
         Self {
             shared,
             facts,
+            signal: Signal::new(&Default::default(), None).unwrap(),
             start: Instant::now(),
             size: [width, width * 3 / 4, width / 2, width * 3 / 8],
             next_frame_ns: 0,
@@ -227,6 +233,7 @@ impl Feed for Mock {
             epoch: now / 100_000_000,
             view_sequence: self.view.stamp.sequence,
             render_ns: self.now_ns() - now,
+            shown_ns: now,
             views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2)],
         };
         show(&header, &payload);
@@ -258,6 +265,8 @@ impl Feed for Mock {
             radius_mm: TIP_RADIUS,
             flags,
             epoch: 0,
+            tip_reference_mm: tip,
+            direction_reference: direction,
         })
     }
 
@@ -302,6 +311,14 @@ impl Feed for Mock {
     fn send_command(&mut self, command: &ToolCommand) {
         self.held = (command.taken != 0).then_some(command.target_mm);
         self.shared.commands.lock().unwrap().push(*command);
+    }
+
+    fn breath(&mut self) -> Option<&mut Signal> {
+        Some(&mut self.signal)
+    }
+
+    fn send_breath(&mut self, state: &BreathState) {
+        self.shared.breaths.lock().unwrap().push(*state);
     }
 
     fn beat(&mut self, _frames: u64, refused: u64) {

@@ -5,7 +5,7 @@
 //! here, two nodes of the field in a register; nodes that it does not settle go on in `Inverter`'s kernels, by damped Newton in the end;
 //! those that fail as well keep their best X and are counted.
 //!
-//! Both in index units of the grid, error of storage half a step: (longest u)/32 767/2. Memory: 8 + 8 + 8 bytes a node (u, v, where v begins next).
+//! Both in index units of the grid, error of storage half a step: (longest u)/32 767/2. Memory: 8 + 8 + 8 bytes a node (u, v, where v begins next), 8 where only u is asked for.
 //! Whoever wants u or X at few points takes [`super::MotionAt`] instead: it collapses nothing.
 
 use super::at::Shape;
@@ -63,8 +63,8 @@ impl Collapsed {
             size: model.grid.size,
             forward: Vec::new(),
             forward_scale: 1.0,
-            inverse: vec![[0; 4]; model.grid.voxel_count()],
-            ahead: vec![[0; 4]; model.grid.voxel_count()],
+            inverse: Vec::new(),
+            ahead: Vec::new(),
             inverse_scale: 1.0,
             inverter: inverter.on_spacing(spacing),
             warm: false,
@@ -100,7 +100,15 @@ impl Collapsed {
         });
     }
 
+    /// u of the last moment, where it lies: in index units of the model's grid, as on its border beyond it.
+    pub fn displacement(&self) -> impl RowField + DisplacementField + Sync + '_ {
+        Nodes { shape: &self.shape, nodes: &self.forward, scale: self.forward_scale }
+    }
+
     fn invert(&mut self) -> CollapseReport {
+        // who wants u alone has no memory for this
+        self.inverse.resize(self.forward.len(), [0; 4]);
+        self.ahead.resize(self.forward.len(), [0; 4]);
         let (old_scale, scale) = (self.inverse_scale, self.forward_scale);
         // v is as long as the longest u; a v that would not fit into 16 bits belongs to no u
         self.inverse_scale = scale;
@@ -241,8 +249,10 @@ impl RowField for Nodes<'_> {
     }
     #[inline]
     fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]) {
-        let (u, slopes) = self.shape.blend_jet(&self.shape.cell(index), |at| numbers(self.nodes[at]));
-        (u * self.scale, slopes.map(|s| s * self.scale))
+        let cell = self.shape.cell(index);
+        let (u, slopes) = self.shape.blend_jet(&cell, |at| numbers(self.nodes[at]));
+        // beyond the border u is constant along that axis
+        (u * self.scale, std::array::from_fn(|d| if cell.held[d] { f32x4::ZERO } else { slopes[d] * self.scale }))
     }
 }
 

@@ -9,6 +9,7 @@ mod container;
 mod fit;
 mod kind;
 mod packed;
+mod remake;
 mod rotation;
 mod whole;
 
@@ -17,6 +18,7 @@ pub use collapse::{CollapseReport, Collapsed};
 pub use fit::{PcaReport, combine, filter, fit_full_cycle, fit_half_cycle, fit_surrogate};
 pub use kind::{Kind, MAX_TERMS, Weights};
 pub use packed::{PackedField, Precision};
+pub use remake::sampled;
 pub use rotation::rotation_of;
 pub use whole::{FieldInverse, invert_field};
 

@@ -5,7 +5,7 @@
 
 use super::field::{Lazy, Motion, WarpError, Whole};
 use maille_displacement::{Inverter, RowField, Scheme};
-use maille_volume::{VolumeInfo, brick::CELL};
+use maille_volume::{Grid, VolumeInfo, brick::CELL};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use wide::f32x4;
@@ -148,18 +148,32 @@ impl Warp {
         }
         let (longest_mm, contraction) = motion.bounds(coefficients);
         self.lay_out(longest_mm);
-        let frames = Frames::new(info, motion);
+        let frames = Frames::new(info, motion.grid());
         let field_nodes = motion.grid().voxel_count();
         // two evaluations a node and one a cell, eight corners each
         if field_nodes > 2 * self.nodes.len() {
             let field = motion.lazy(coefficients);
-            return Ok(self.invert(&frames, &field as &Lazy<'_>, motion, contraction));
+            return Ok(self.invert(&frames, &field as &Lazy<'_>, motion.grid(), contraction));
         }
         let mut memory = std::mem::take(&mut self.collapsed);
         let field = motion.collapse(coefficients, &mut memory);
-        let report = self.invert(&frames, &field as &Whole<'_>, motion, contraction);
+        let report = self.invert(&frames, &field as &Whole<'_>, motion.grid(), contraction);
         self.collapsed = memory;
         Ok(report)
+    }
+
+    /// The inverse of somebody else's field, where it lies: in index units of `grid`, no vector longer than `longest_mm`, of this contraction along
+    /// the grid's axes in millimetres. Numbers that are not finite end in nodes that are not settled, and are counted.
+    pub fn update_field(
+        &mut self,
+        info: &VolumeInfo,
+        grid: &Grid,
+        field: &(impl RowField + Sync),
+        longest_mm: f32,
+        contraction: f32,
+    ) -> WarpReport {
+        self.lay_out(longest_mm);
+        self.invert(&Frames::new(info, grid), field, grid, contraction)
     }
 
     /// Makes room for a motion of this length; what was known is kept when there is room already.
@@ -184,8 +198,8 @@ impl Warp {
         self.warm = false;
     }
 
-    fn invert(&mut self, frames: &Frames, field: &(impl RowField + Sync), motion: &Motion, contraction: f32) -> WarpReport {
-        let smallest_mm = motion.grid().min_spacing() as f32;
+    fn invert(&mut self, frames: &Frames, field: &(impl RowField + Sync), grid: &Grid, contraction: f32) -> WarpReport {
+        let smallest_mm = grid.min_spacing() as f32;
         let q = contraction.clamp(0.01, 0.95);
         let inverter = Inverter {
             scheme: Scheme::Newton,
@@ -194,7 +208,7 @@ impl Warp {
             weight: [1.0; 3],
             max_iterations: 60,
         }
-        .on_spacing(motion.grid().spacing.map(|s| s as f32));
+        .on_spacing(grid.spacing.map(|s| s as f32));
         let [nx, ny, _] = self.counts;
         let (origin, pitch) = (self.origin, self.pitch);
         let world = |i: usize, j: usize, k: usize| {
@@ -434,9 +448,9 @@ struct Frames {
 }
 
 impl Frames {
-    fn new(info: &VolumeInfo, motion: &Motion) -> Self {
-        let (volume, field) = (&info.grid, motion.grid());
-        let matrix = |grid: &maille_volume::Grid| -> Matrix3<f64> { grid.world_from_index_matrix() };
+    fn new(info: &VolumeInfo, field: &Grid) -> Self {
+        let volume = &info.grid;
+        let matrix = |grid: &Grid| -> Matrix3<f64> { grid.world_from_index_matrix() };
         let back = matrix(field).try_inverse().unwrap_or_else(Matrix3::identity);
         let to_field = back * matrix(volume);
         let shift = back * (Vector3::from(volume.origin) - Vector3::from(field.origin));
