@@ -23,9 +23,10 @@ struct Run {
 }
 
 impl Run {
-    fn start() -> Self {
+    fn start(scene: &[&str]) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_maille"))
             .args(["run", "--duration", "300s"])
+            .args(scene)
             .stdout(Stdio::piped())
             .spawn()
             .expect("maille starts");
@@ -114,7 +115,7 @@ fn the_page_lives_obeys_and_survives_a_killed_rendering() {
         eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
         return;
     };
-    let run = Run::start();
+    let run = Run::start(&[]);
     let mut browser = Browser::open(&chromium, &run.address, 1600, 900);
     browser.until("the first frame", "Number(document.body?.dataset.frames ?? 0) >= 2");
     browser.evaluate(HELPERS);
@@ -187,4 +188,62 @@ fn the_page_lives_obeys_and_survives_a_killed_rendering() {
     assert_eq!(browser.complaints, Vec::<String>::new());
     drop(browser);
     run.end();
+}
+
+/// A small torso that breathes; nothing touches it.
+const BREATHING: &str = "name = \"breath\"\n[volume]\nphantom = \"torso\"\nsize = [96, 72, 96]\n[breathing]\nperiod_s = 3.0\n\
+                         [rendering]\nsize = [240, 180]\ntransfer = \"skin\"\nfrom = [1.0, -0.3, 0.1]\n[effects]\nbreathing = true\nsections = true\n";
+
+#[test]
+fn the_page_holds_the_breath_leads_it_and_lets_it_go_on() {
+    let Some(chromium) = chromium() else {
+        assert!(std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
+        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
+        return;
+    };
+    let scene = std::env::temp_dir().join(format!("maille-page-breath-{}.toml", std::process::id()));
+    std::fs::write(&scene, BREATHING).expect("a scene");
+    let run = Run::start(&[scene.to_str().expect("a path in UTF-8")]);
+    let mut browser = Browser::open(&chromium, &run.address, 1600, 900);
+    browser.until("the first frame", "Number(document.body?.dataset.frames ?? 0) >= 2");
+    browser.evaluate(HELPERS);
+    browser.until("the panel", "!document.getElementById('panel-breath').hidden");
+    let level = |browser: &mut Browser| number(browser.evaluate("Number(document.body.dataset.level)"));
+
+    // by itself
+    browser.until("inspiration", "document.body.dataset.breath === 'in'");
+    browser.until("expiration", "document.body.dataset.breath === 'out'");
+    browser.evaluate("document.getElementById('panel-breath').scrollIntoView(); true");
+    click(&mut browser, "breath-hold");
+    browser.until("the breath held", "document.body.dataset.breath === 'held'");
+    std::thread::sleep(Duration::from_millis(1500));
+    let held = level(&mut browser);
+    std::thread::sleep(Duration::from_millis(1000));
+    assert!((level(&mut browser) - held).abs() < 0.01, "a held breath stands");
+
+    // led to both ends, and the picture goes along
+    let lead = |browser: &mut Browser, to: f64| {
+        browser.evaluate(&format!(
+            "(() => {{ const e = document.getElementById('breath-level'); e.value = {to}; e.dispatchEvent(new Event('input')); return true; }})()"
+        ));
+        browser.until(
+            "the level",
+            &format!("Math.abs(Number(document.body.dataset.level) - {to}) < 0.02 && document.body.dataset.breath === 'led'"),
+        );
+        frames(browser, 4);
+    };
+    lead(&mut browser, 1.0);
+    browser.evaluate("window.full = grey('3d'); true");
+    lead(&mut browser, 0.0);
+    let empty = number(browser.evaluate("changed(full, grey('3d'))"));
+    lead(&mut browser, 1.0);
+    let again = number(browser.evaluate("changed(full, grey('3d'))"));
+    assert!(empty > 0.004 && empty > 4.0 * again, "the belly comes and goes: {empty}, back where it was: {again}");
+
+    click(&mut browser, "breath-free");
+    browser.until("breathing that goes on", "['in', 'out'].includes(document.body.dataset.breath)");
+    assert_eq!(browser.complaints, Vec::<String>::new());
+    drop(browser);
+    run.end();
+    let _ = std::fs::remove_file(&scene);
 }

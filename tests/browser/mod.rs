@@ -8,6 +8,7 @@ use std::{
     net::TcpStream,
     path::{Path, PathBuf},
     process::{Child, Command, Stdio},
+    sync::atomic::{AtomicUsize, Ordering::Relaxed},
     time::{Duration, Instant},
 };
 use tungstenite::{Message, WebSocket};
@@ -36,7 +37,9 @@ pub struct Browser {
 impl Browser {
     /// Starts Chromium and opens an address in a window of a size.
     pub fn open(chromium: &Path, address: &str, width: u32, height: u32) -> Self {
-        let profile = std::env::temp_dir().join(format!("maille-page-test-{}", std::process::id()));
+        static BROWSERS: AtomicUsize = AtomicUsize::new(0);
+        let number = BROWSERS.fetch_add(1, Relaxed);
+        let profile = std::env::temp_dir().join(format!("maille-page-test-{}-{number}", std::process::id()));
         fs::create_dir_all(&profile).expect("a directory for the browser's profile");
         let child = Command::new(chromium)
             .args(["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"])

@@ -160,3 +160,154 @@ impl MovingTissue for Moment<'_> {
         self.moved.into()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maille_breathing::{Regions, Signal};
+    use maille_contact::{Coupling, HapticConfig, HapticCore, Surface, TickInputs};
+    use maille_contract::{
+        MotionHeader, Stamp,
+        breath::{MOTION_KIND, MOTION_REGION},
+    };
+    use maille_motion::{MotionModel, Precision, model::sampled};
+    use maille_scene::Scene;
+    use maille_store::{StoreKeeper, StoreSizes};
+    use maille_transport::{ControlMap, Domain};
+    use maille_volume::{Grid, Rescale, Volume, VolumeSample};
+
+    const MS: u64 = 1_000_000;
+
+    /// A domain whose patient moves by `u` at level 1, which it has from a second on.
+    fn breathing(u: impl Fn([f64; 3]) -> [f64; 3] + Sync, then: impl FnOnce(&mut Breather<'_>)) {
+        let domain = Domain::fresh().unwrap();
+        let control = ControlMap::create(&domain).unwrap();
+        let volume = Volume::new(Grid::axis_aligned([16; 3], [1.0; 3]), Rescale { slope: 1.0, intercept: 0.0 }, vec![0; 4096]);
+        let mut keeper = StoreKeeper::create(&domain, &volume, StoreSizes::for_volume(8, 0, 3, false), |_| {}).unwrap();
+        let nodes = Grid { origin: [-60.0; 3], ..Grid::axis_aligned([41; 3], [3.0; 3]) };
+        let model = MotionModel::of_signals(&[sampled(&nodes, u)], Precision::F32).unwrap().to_bytes();
+        let header = MotionHeader { bytes: model.len() as u64, storage_error_mm: 0.0 };
+        keeper.add_region(&domain, MOTION_REGION, MOTION_KIND, &header, model.len(), |to| to.copy_from_slice(&model)).unwrap();
+        let text = "[volume]\nphantom = \"torso\"\n[breathing]\nsignal = \"console\"\n[effects]\nbreathing = true";
+        let scene = Scene::parse("test", text).unwrap();
+        let mut regions = Regions::open(&domain, &scene).unwrap().unwrap();
+        let mut breather = Breather::new(regions.patient().unwrap());
+        let page = Signal::open(&domain, &scene).unwrap().unwrap();
+        let stamp = Stamp { time_ns: 1000 * MS, sequence: 1, incarnation: 1 };
+        control.breath.store(&page.command(stamp, false, Some(1.0)).unwrap());
+        assert!(breather.listen(&control));
+        then(&mut breather);
+        drop(breather);
+        drop((regions, keeper, control));
+        domain.remove().unwrap();
+    }
+
+    fn pose(position_mm: [f64; 3]) -> DevicePose {
+        DevicePose { position_mm, direction: [0.0, 0.0, -1.0], velocity_mm_s: Some([0.0; 3]), valid: true }
+    }
+
+    /// Tissue below z = 0, at rest.
+    struct Floor;
+
+    impl Surface for Floor {
+        fn value(&self, at: [f64; 3]) -> Option<f64> {
+            self.sample(at).map(|s| s.value)
+        }
+        fn sample(&self, at: [f64; 3]) -> Option<VolumeSample> {
+            Some(VolumeSample { value: 40.0 - 100.0 * at[2], gradient: [0.0, 0.0, -100.0] })
+        }
+        fn threshold(&self) -> f64 {
+            40.0
+        }
+        fn resolution_mm(&self) -> f64 {
+            1.0
+        }
+    }
+
+    #[test]
+    fn tissue_that_comes_is_felt_without_a_step_and_pushes_where_its_surface_looks() {
+        // the floor rises by 6 mm and leans by 0.2 rad about y
+        let (sin, cos) = 0.2f64.sin_cos();
+        let turn = move |x: [f64; 3]| [cos * x[0] + sin * x[2] - x[0], 0.0, 6.0 - sin * x[0] + cos * x[2] - x[2]];
+        breathing(turn, |breather| {
+            let mut core = HapticCore::new(HapticConfig::new(3.0, Coupling::lowered(1.0, 0.001, 0.005, 1e-3).unwrap().0));
+            let mut last: Option<V3> = None;
+            let mut out = None;
+            for tick in 0..6000u64 {
+                let mut pose = pose([0.0, 0.0, 4.0]);
+                let mut moment = breather.enter(tick * MS, &mut pose, &mut None);
+                assert!(moment.residual_mm.is_some_and(|r| r < 1.5e-3));
+                let inputs = TickInputs {
+                    now_ns: tick * MS,
+                    pose,
+                    pose_age_s: 0.0,
+                    tissue: Some(&Floor),
+                    epoch: 1,
+                    tissue_age_s: 0.0,
+                    release: false,
+                };
+                let mut felt = core.tick_in(&inputs, Some(&mut moment));
+                moment.leave(&mut felt);
+                assert_eq!(felt.tip_mm, [0.0, 0.0, 4.0]);
+                let force = V3::from(felt.force_n);
+                assert!(last.is_none_or(|last| (force - last).norm() < 0.02), "{tick}: {last:?} {force:?}");
+                assert!(tick > 1000 || force.norm() == 0.0, "{tick}: nothing is there yet");
+                last = Some(force);
+                out = Some(felt);
+            }
+            let felt = out.unwrap();
+            // the leaning floor: normal (sin, 0, cos), 6 mm up along z; the ball's centre is 4 mm up
+            let (force, normal) = (V3::from(felt.force_n), V3::new(sin, 0.0, cos));
+            let depth = 3.0 - (4.0 - 6.0) * cos;
+            assert!((felt.penetration_mm - depth).abs() < 0.02, "{} of {depth}", felt.penetration_mm);
+            // what friction of skin that has turned below the tool has left
+            assert!(force.norm() > 0.2 && force.normalize().dot(&normal) > 0.97, "{force:?}");
+            assert!((V3::from(felt.normal) - normal).norm() < 0.01);
+        });
+    }
+
+    #[test]
+    fn where_tissue_is_folded_the_force_fades_and_comes_back_behind_it() {
+        // turned inside out between x = 12 and 24
+        let fold = |x: [f64; 3]| [if x[0] > 24.0 { -24.0 } else { -2.0 * (x[0] - 12.0).max(0.0) }, 0.0, 0.0];
+        breathing(fold, |breather| {
+            let mut lost = 0;
+            let mut last = None::<f64>;
+            for tick in 0..9000u64 {
+                // from where all is well over the fold's image and back
+                let x = 11.0 - 16.0 * (tick as f64 * 1e-3).sin();
+                let mut pose = pose([x, 0.0, 0.0]);
+                let moment = breather.enter(4000 * MS + tick * MS, &mut pose, &mut None);
+                assert_eq!(moment.residual_mm.is_some(), pose.valid);
+                lost += u64::from(!pose.valid);
+                if pose.valid {
+                    assert!(moment.residual_mm.is_some_and(|r| r < 2e-3) && pose.position_mm.iter().all(|v| v.is_finite()));
+                    last = Some(pose.position_mm[0]);
+                }
+            }
+            // three reference positions for each place: the one that is followed ends at the fold
+            assert!(last.is_some() && lost < 9000, "{lost}");
+        });
+        let broken = |x: [f64; 3]| [-3.0 * x[0], 0.0, 0.0];
+        breathing(broken, |breather| {
+            let mut pose = pose([5.0, 0.0, 0.0]);
+            let moment = breather.enter(9000 * MS, &mut pose, &mut None);
+            assert!(moment.residual_mm.is_none() && !pose.valid, "det F < 0 everywhere");
+        });
+    }
+
+    #[test]
+    fn balls_of_a_tool_stay_rigid_in_the_world() {
+        // stretched along x by a third more
+        breathing(
+            |x| [x[0] / 3.0, 0.0, 0.0],
+            |breather| {
+                let mut pose = pose([8.0, 0.0, 0.0]);
+                breather.enter(8999 * MS, &mut pose.clone(), &mut None);
+                let mut moment = breather.enter(9000 * MS, &mut pose, &mut None);
+                let placed = moment.place([12.0, 4.0, 0.0]);
+                assert!((placed[0] - 9.0).abs() < 0.01 && (placed[1] - 4.0).abs() < 0.01, "{placed:?}");
+            },
+        );
+    }
+}

@@ -1,8 +1,8 @@
 //! The warp of a frame: where the patient who breathes lies at the frame's simulation time.
 //!
 //! The mapped fields are summed up where they lie, for the moment, and the ray caster's lattice is inverted from that sum, warm from the last frame's. The lattice is as
-//! coarse as the scene's tolerance allows at the ends of usual breathing, found once at the start; every frame's bound on the error of what is
-//! shown goes to the report.
+//! coarse as the scene's tolerance allows at the ends of usual breathing, found once at the start; how far from
+//! its place anything may be drawn goes to the report for every frame.
 
 use maille_breathing::Patient;
 use maille_contract::ControlBlock;
@@ -42,7 +42,7 @@ impl<'a> Breather<'a> {
             breather.warp = Warp::new(info, options(pitch));
             // both ends of a breath; deepest first, so that the lattice has room for all that follows
             let usual = [Breath { level: 1.0, rate: 0.0, phase: 0.0 }, Breath::EXPIRED, Breath { level: 0.5, rate: -0.8, phase: 0.25 }];
-            let worst = usual.map(|breath| breather.bend(breath)).into_iter().fold(0.0f32, |worst, found| worst.max(found.error_mm));
+            let worst = usual.map(|breath| drawn_off_mm(&breather.bend(breath))).into_iter().fold(0.0, f32::max);
             if f64::from(worst) <= tolerance_mm {
                 break;
             }
@@ -69,8 +69,91 @@ impl<'a> Breather<'a> {
         self.warp.update_field(&self.info, model.grid(), &self.collapsed.displacement(), longest_mm, contraction)
     }
 
-    /// What the last frame's warp is worth.
-    pub fn report(&self) -> &WarpReport {
-        &self.report
+    /// What the last frame's warp is worth: how far from its place anything is drawn [mm], and nodes without a rest position.
+    pub fn report(&self) -> (f64, u64) {
+        (drawn_off_mm(&self.report).into(), self.report.unsettled as u64)
+    }
+}
+
+/// How far from where it is anything is drawn [mm]: what is shown at x is X, whose place is X + u(X). That is the residual itself, at its worst in the
+/// middle of the lattice's cells, and the bend between knots; whatever the contraction, by which the report bounds the error in X.
+fn drawn_off_mm(report: &WarpReport) -> f32 {
+    let knots = report.error_mm - report.lattice_mm;
+    report.lattice_mm * (1.0 - report.contraction.clamp(0.01, 0.95)) + knots
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{compose::Composer, view::View};
+    use maille_breathing::{Regions, Signal};
+    use maille_contract::{
+        FrameHeader, MotionHeader, Role, Stamp,
+        breath::{MOTION_KIND, MOTION_REGION},
+    };
+    use maille_motion::{MotionModel, Precision, model::sampled};
+    use maille_scene::{BoxMm, Scene};
+    use maille_store::{Reader, StoreKeeper, StoreSizes};
+    use maille_transport::{ControlMap, Domain};
+    use maille_volume::{Grid, Rescale, Volume};
+
+    const SCENE: &str = "[volume]\nphantom = \"torso\"\n[breathing]\nsignal = \"console\"\n[effects]\nbreathing = true\n\
+                         [rendering]\nmode = \"isosurface\"\nsize = [160, 120]\nfrom = [0.0, -1.0, 0.0]\ndistance = 1.4\n";
+
+    fn drawn(scene: &Scene, reader: &Reader, warp: Option<&Warp>, eye_mm: f64) -> Vec<u8> {
+        let mut scene = scene.clone();
+        let box_mm = BoxMm::of(&reader.info().grid);
+        let view = scene.rendering.view(&box_mm);
+        let lifted = |p: [f64; 3]| Some([p[0], p[1], p[2] + eye_mm]);
+        (scene.rendering.eye, scene.rendering.target) = (lifted(view.eye), lifted(view.target));
+        let mut composer = Composer::new(&scene);
+        composer.draw(&reader.snapshot(), warp, &View::new(&scene, &box_mm).unwrap(), None, false).unwrap();
+        let mut pixels = vec![0; composer.bytes()];
+        composer.write(&mut pixels, FrameHeader::default());
+        pixels
+    }
+
+    #[test]
+    fn a_patient_carried_as_a_whole_is_the_patient_seen_from_elsewhere() {
+        let grid = Grid::axis_aligned([64; 3], [1.0; 3]);
+        let solid = |n: usize| {
+            let [x, y, z] = [n % 64, n / 64 % 64, n / 4096].map(|c| c as f64 - 31.5);
+            x * x + y * y + z * z < 400.0 || (x.abs() < 4.0 && y.abs() < 4.0)
+        };
+        let voxels = (0..grid.voxel_count()).map(|n| if solid(n) { 60 } else { -1000 }).collect();
+        let volume = Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels);
+        let domain = Domain::fresh().unwrap();
+        let control = ControlMap::create(&domain).unwrap();
+        let mut keeper = StoreKeeper::create(&domain, &volume, StoreSizes::for_volume(64, 16, 3, false), |_| {}).unwrap();
+        // everything up by 8 mm at level 1
+        let nodes = Grid { origin: [-20.0; 3], ..Grid::axis_aligned([9; 3], [13.0; 3]) };
+        let model = MotionModel::of_signals(&[sampled(&nodes, |_| [0.0, 0.0, 8.0])], Precision::I16).unwrap().to_bytes();
+        let header = MotionHeader { bytes: model.len() as u64, storage_error_mm: 0.0 };
+        keeper.add_region(&domain, MOTION_REGION, MOTION_KIND, &header, model.len(), |to| to.copy_from_slice(&model)).unwrap();
+
+        let scene = Scene::parse("test", SCENE).unwrap();
+        let reader = Reader::open(&domain, Role::Rendering).unwrap();
+        let mut regions = Regions::open(&domain, &scene).unwrap().unwrap();
+        let mut breather = Breather::new(regions.patient().unwrap(), reader.info(), 0.1);
+        // as the page leads it: fully in, from some time on
+        let page = Signal::open(&domain, &scene).unwrap().unwrap();
+        let stamp = Stamp { time_ns: 1_000_000_000, sequence: 1, incarnation: 1 };
+        control.breath.store(&page.command(stamp, false, Some(1.0)).unwrap());
+        assert!(breather.listen(&control));
+
+        let still = drawn(&scene, &reader, None, 0.0);
+        let before = drawn(&scene, &reader, Some(breather.go(500_000_000)), 0.0);
+        let moved = drawn(&scene, &reader, Some(breather.go(20_000_000_000)), 0.0);
+        let seen_from_below = drawn(&scene, &reader, None, -8.0);
+        let differ = |a: &[u8], b: &[u8]| a.iter().zip(b).filter(|(a, b)| a.abs_diff(**b) > 24).count() as f64 / a.len() as f64;
+        let (off_mm, unsettled) = breather.report();
+        assert!(unsettled == 0 && off_mm < 0.01, "{off_mm} {unsettled}");
+        assert!(differ(&before, &still) < 0.001, "before the command nothing moves: {}", differ(&before, &still));
+        // what samples along a ray begin at differs; edges of a pixel
+        let (same, other) = (differ(&moved, &seen_from_below), differ(&moved, &still));
+        assert!(same < 0.005 && other > 0.02 && other > 10.0 * same, "{same} {other}");
+        drop(breather);
+        drop((regions, reader, keeper, control));
+        domain.remove().unwrap();
     }
 }

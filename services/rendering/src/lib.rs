@@ -124,10 +124,10 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         }
         last_sent_ns = now;
         if life.record(now, monotonic_ns() - now, None)
-            && let Some(report) = breather.as_ref().map(breath::Breather::report)
+            && let Some((off_mm, unsettled)) = breather.as_ref().map(breath::Breather::report)
         {
-            life.control().warp.record((f64::from(report.error_mm) * 1e6) as u64);
-            life.cell().count(Counter::Failures, report.unsettled as u64);
+            life.control().warp.record((off_mm * 1e6) as u64);
+            life.cell().count(Counter::Failures, unsettled);
         }
     }
 }

@@ -209,7 +209,7 @@ pub struct ControlBlock {
     pub breath: LatestCell<{ words::<BreathState>() }>,
     /// residual of a tick's inversion [nm, in place of ns]. Writer: haptic
     pub inversion: SharedHistogram,
-    /// bound on the error of a frame's warp [nm, in place of ns]. Writer: rendering
+    /// how far from its place anything in a frame may be drawn, by its warp [nm, in place of ns]. Writer: rendering
     pub warp: SharedHistogram,
     /// one for each [`Role`](crate::Role)
     pub services: [ServiceCell; 4],

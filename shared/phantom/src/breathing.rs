@@ -23,8 +23,8 @@ pub fn torso(at: [f64; 3]) -> [[f64; 3]; 2] {
     let [x, y, z] = at;
     // from the back, which lies on the table, to the front
     let front = step(60.0, -110.0, y);
-    // where organs glide: not at the spine, less towards the wall
-    let inside = bell(x, 120.0) * bell(y + 30.0, 88.0);
+    // where organs glide: hardly at the spine and below the skin
+    let inside = bell(x, 120.0) * bell(y + 5.0, if y < -5.0 { 80.0 } else { 70.0 });
     let dome = |above: f64| {
         let d = z - above;
         if d > 0.0 { bell(d, 95.0) } else { bell(d, 125.0) }

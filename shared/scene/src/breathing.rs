@@ -64,7 +64,7 @@ pub struct Breathing {
     pub precision_bits: u32,
     /// residual |x − X − u(X)| to which a tick finds the device's rest position [mm], 0.0002 to 0.1 (a knob)
     pub inversion_tolerance_mm: f64,
-    /// error allowed in the rest position of what a picture shows [mm], 0.01 to 1 (a knob)
+    /// how far from its place a picture may show anything [mm], 0.01 to 1 (a knob)
     pub picture_tolerance_mm: f64,
 }
 

@@ -398,9 +398,9 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "breathing.picture_tolerance_mm",
         effect: "breathing",
-        summary: "error allowed in the rest position of what a picture shows",
+        summary: "how far from its place a picture may show anything",
         defaults: [0.3, 0.1, 0.03],
-        error: "bound on the error of a sample's rest position [mm], of every frame, in the report",
+        error: "residual |x − X − u(X)| of what is shown [mm], of every frame, in the report",
         truth: "the inverse solved at the sample itself",
         cost: "frame time",
         get: |s| s.breathing.picture_tolerance_mm,

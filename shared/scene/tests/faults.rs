@@ -145,3 +145,24 @@ fn files_are_looked_up_beside_the_scene_and_a_missing_one_points_at_its_line() {
     assert!(Scene::load(folder.join("none.toml")).unwrap_err().to_string().contains("cannot read the scene"));
     fs::remove_dir_all(&folder).unwrap();
 }
+
+#[test]
+fn a_patient_whom_nothing_tells_how_to_breathe_is_refused() {
+    let error = fault("[volume]\nphantom = \"head\"\n[effects]\nbreathing = true");
+    assert!(error.to_string().starts_with("scene.toml:4: nothing says how this patient breathes"), "{error}");
+    assert!(error.advice().is_some_and(|advice| advice.contains("maille motion fit")));
+    let torso = |breathing: &str| format!("[volume]\nphantom = \"torso\"\n[breathing]\n{breathing}\n[effects]\nbreathing = true");
+    assert!(Scene::parse("scene.toml", &torso("")).is_ok());
+    assert!(fault(&torso("precision_bits = 24")).to_string().contains("16 or 32 bits"));
+    assert!(fault(&torso("depth = 2")).to_string().contains("depth = 2 is out of range"));
+    let folder = std::env::temp_dir().join(format!("maille-scene-breath-{}", std::process::id()));
+    fs::create_dir_all(&folder).unwrap();
+    fs::write(folder.join("spirometry.csv"), "").unwrap();
+    fs::write(folder.join("scene.toml"), torso("signal = \"spirometri.csv\"")).unwrap();
+    let error = Scene::load(folder.join("scene.toml")).unwrap_err();
+    assert!(
+        error.to_string().contains("there is no trace of breathing") && error.advice().unwrap().contains("did you mean `spirometry.csv`?"),
+        "{error}"
+    );
+    fs::remove_dir_all(&folder).unwrap();
+}

@@ -1,7 +1,7 @@
 //! A model on other nodes or in another precision, and a model from fields that are known already.
 //!
 //! What it costs is told in millimetres at usual breathing: levels 0 to 1 and the rates of a breath of four seconds. Coarser nodes: |u − u′| at the nodes of
-//! the finer grid, the sum of the fields' differences under their coefficients; storage: [`MotionModel::storage_error_mm`].
+//! the finer grid; storage: [`MotionModel::storage_error_mm`].
 
 use super::{Kind, MotionModel, PackedField, Precision, Weights};
 use crate::resample::{grid_of_size, resample};
@@ -54,23 +54,30 @@ impl MotionModel<'_> {
             nodes.clamp(2, given.size[c])
         });
         let grid = if size == given.size { given.clone() } else { grid_of_size(given, size) };
-        let mut most = vec![0.0f32; self.fields().len()];
-        for (k, c) in usual().flat_map(|breath| self.weights(&breath).iter().collect::<Vec<_>>()) {
-            most[k] = most[k].max(c.abs());
+        let (kind, fields) = self.by_level();
+        let coarse: Vec<VectorField> = fields.iter().map(|f| if grid == *given { f.clone() } else { resample(f, &grid) }).collect();
+        let packed = coarse.iter().enumerate().map(|(n, f)| PackedField::pack(f, precision, n)).collect::<Result<_, _>>()?;
+        let error = if grid == *given {
+            0.0
+        } else {
+            let lost: Vec<VectorField> = fields.iter().zip(&coarse).map(|(f, c)| minus(f, &resample(c, given))).collect();
+            usual().map(|breath| longest(&lost, &kind.weights(&breath))).fold(0.0, f32::max)
+        };
+        Ok((MotionModel::new(grid, kind, packed), error))
+    }
+
+    /// The same motion in numbers of like size. A surrogate's constant is the motion at g = 0, which may be far from any breath (no air at all in the
+    /// lung): then large fields cancel, and every bound on a sum is far too large. With levels for signals the constant is the end of expiration.
+    fn by_level(&self) -> (Kind, Vec<VectorField>) {
+        let mut fields: Vec<VectorField> = self.fields().iter().map(|f| f.unpack(self.grid())).collect();
+        let &Kind::Surrogate { signals, ends: [out, full] } = self.kind() else { return (self.kind().clone(), fields) };
+        let level = fields[0].clone();
+        let constant = &mut fields[signals];
+        constant.vectors.par_iter_mut().zip(&level.vectors).for_each(|(c, g)| *c = std::array::from_fn(|d| c[d] + out as f32 * g[d]));
+        for field in fields.iter_mut().take(signals.min(2)) {
+            field.vectors.par_iter_mut().for_each(|v| *v = v.map(|c| c * (full - out) as f32));
         }
-        let mut error = 0.0;
-        let mut packed = Vec::with_capacity(most.len());
-        for (n, field) in self.fields().iter().enumerate() {
-            let field = field.unpack(given);
-            if grid == *given {
-                packed.push(PackedField::pack(&field, precision, n)?);
-                continue;
-            }
-            let coarse = resample(&field, &grid);
-            error += most[n] * apart(&field, &resample(&coarse, given));
-            packed.push(PackedField::pack(&coarse, precision, n)?);
-        }
-        Ok((MotionModel::new(grid, self.kind().clone(), packed), error))
+        (Kind::Surrogate { signals, ends: [0.0, 1.0] }, fields)
     }
 
     /// Bound on the error of u from storage, at usual breathing [mm].
@@ -87,9 +94,18 @@ impl MotionModel<'_> {
     }
 }
 
-fn apart(a: &VectorField, b: &VectorField) -> f32 {
-    let length = |(a, b): (&[f32; 3], &[f32; 3])| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f32>().sqrt();
-    a.vectors.par_iter().zip(&b.vectors).map(length).reduce(|| 0.0, f32::max)
+fn minus(a: &VectorField, b: &VectorField) -> VectorField {
+    let vectors = a.vectors.par_iter().zip(&b.vectors).map(|(a, b)| std::array::from_fn(|c| a[c] - b[c])).collect();
+    VectorField { grid: a.grid.clone(), vectors }
+}
+
+/// The longest vector of a sum.
+fn longest(fields: &[VectorField], weights: &Weights) -> f32 {
+    let length = |n: usize| {
+        let sum = weights.iter().fold([0.0f32; 3], |sum, (k, c)| std::array::from_fn(|d| sum[d] + c * fields[k].vectors[n][d]));
+        sum.iter().map(|v| v * v).sum::<f32>().sqrt()
+    };
+    (0..fields[0].vectors.len()).into_par_iter().map(length).reduce(|| 0.0, f32::max)
 }
 
 /// Vectors of a formula at the nodes of a grid.
@@ -103,6 +119,26 @@ pub fn sampled(grid: &Grid, u: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> VectorFi
 mod tests {
     use super::*;
     use crate::MotionAt;
+
+    #[test]
+    fn a_surrogate_of_litres_of_air_moves_as_before_and_its_numbers_are_of_like_size() {
+        let grid = Grid::axis_aligned([9, 8, 7], [12.0; 3]);
+        // u = 0 at 3000 ml, in between the ends
+        let field = |scale: f64| sampled(&grid, move |at| [scale * 0.004 * (0.02 * at[0]).sin(), 0.0, -scale * 0.008]);
+        let phases: Vec<VectorField> = [2500.0, 2800.0, 3000.0, 3400.0, 3100.0].map(|g| field(g - 3000.0)).into();
+        let signals: Vec<Vec<f64>> = [2500.0, 2800.0, 3000.0, 3400.0, 3100.0].map(|g| vec![g, 3.0 * (g * 0.01f64).sin()]).into();
+        let model = crate::model::fit_surrogate(&phases, &signals, [2500.0, 3400.0], Precision::F32).unwrap();
+        let (remade, error) = model.remade(12.0, Precision::I16).unwrap();
+        for breath in usual() {
+            let (a, b) = (MotionAt::new(&model, model.weights(&breath)), MotionAt::new(&remade, remade.weights(&breath)));
+            let (a, b) = (a.displacement_mm([40.0, 30.0, 20.0]), b.displacement_mm([40.0, 30.0, 20.0]));
+            // the given one cancels 24 mm in f32
+            assert!((0..3).all(|c| (a[c] - b[c]).abs() < 2e-3), "{breath:?} {a:?} {b:?}");
+        }
+        let full = Breath { level: 1.0, rate: 0.0, phase: 0.0 };
+        let (before, after) = (model.bounds(&model.weights(&full)).0, remade.bounds(&remade.weights(&full)).0);
+        assert!(error == 0.0 && before > 40.0 && after < 14.0, "{before} {after}");
+    }
 
     #[test]
     fn a_model_of_known_fields_moves_as_they_say_and_coarser_nodes_cost_what_is_told() {
