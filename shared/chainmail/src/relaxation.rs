@@ -10,7 +10,8 @@
 //!
 //! cut to the interval that its links, its bound and the tools leave it. That is projected Gauss–Seidel on a convex energy: no step can raise it
 //! and none can break a link. A brick is swept element by element, and of the eight parities of bricks one at a time, so that bricks swept
-//! together are no neighbours: the result is the same bits with any number of threads. Elements that are at r stay there: the
+//! together are no neighbours: the result is the same bits with any number of threads. A batch may be stopped after any few bricks, and the
+//! next one goes on from there. Elements that are at r stay there: the
 //! displaced region only shrinks.
 //!
 //! **Plastic part.** After a push r follows u so far that |u − r| ≤ (1 − φ)|u|, φ the plastic fraction of the tissue; so tissue comes back to φ
@@ -37,11 +38,14 @@ pub struct RelaxOptions {
     pub snap_mm: f32,
     /// tools hold back elements of at least this value [HU]; `None`: all, air too
     pub tools_hold_hu: Option<f64>,
+    /// where the sweeps begin: [`Relaxed::next`] of a batch that was stopped, so that the next one goes on there and no brick is forgotten
+    /// however short batches are
+    pub first: usize,
 }
 
 impl Default for RelaxOptions {
     fn default() -> Self {
-        Self { sweeps: 4, anchor: 0.1, snap_mm: 1e-4, tools_hold_hu: None }
+        Self { sweeps: 4, anchor: 0.1, snap_mm: 1e-4, tools_hold_hu: None, first: 0 }
     }
 }
 
@@ -67,6 +71,8 @@ pub struct Relaxed {
     pub sweeps: u32,
     /// nothing moves any more, unless a push, a tool or the tissue changes
     pub settled: bool,
+    /// where the first sweep was stopped; where it began if it was not
+    pub next: usize,
 }
 
 /// The fraction φ of a displacement that stays, for tissue of at least `from_hu`.
@@ -146,11 +152,16 @@ impl ChainMail {
             .filter(usable)
             .map(|t| Capsule { a: self.along_axes(&grid, t.a), b: self.along_axes(&grid, t.b), radius_mm: t.radius_mm })
             .collect();
-        let mut out = Relaxed::default();
+        let mut out = Relaxed { next: options.first, ..Relaxed::default() };
         while out.sweeps < options.sweeps && !out.settled {
             match self.sweep(rest, options, &tools, stop) {
-                Some(moved) => out.settled = !moved,
-                None => break,
+                Ok(moved) => out.settled = !moved,
+                Err(at) => {
+                    if out.sweeps == 0 {
+                        out.next = at;
+                    }
+                    break;
+                }
             }
             out.sweeps += 1;
         }
@@ -159,14 +170,14 @@ impl ChainMail {
         out
     }
 
-    /// One sweep over what is displaced: whether something moved; `None`: stopped.
+    /// One sweep over what is displaced: whether something moved; an error says where it was stopped.
     fn sweep<S: BrickSource + ?Sized>(
         &mut self,
         rest: &S,
         options: &RelaxOptions,
         tools: &[Capsule],
         stop: &dyn Fn() -> bool,
-    ) -> Option<bool> {
+    ) -> Result<bool, usize> {
         let layout = *self.layout();
         let away = |b: &crate::state::ElementBrick| b.range != [[0.0; 2]; 3] || b.plastic.is_some();
         let mut active: Vec<BrickId> = self.elements.bricks().iter().filter(|b| away(b)).map(|b| b.id).collect();
@@ -184,34 +195,38 @@ impl ChainMail {
         let parity = |id: BrickId| layout.coordinates(id).iter().fold(0, |p, c| 2 * p + c % 2);
         let tiles = &Mutex::new(Vec::new());
         let mut moved = false;
+        let mut parts: Vec<Vec<usize>> = Vec::new();
         for colour in 0..8 {
             let slots: Vec<usize> = active.iter().filter(|&&id| parity(id) == colour).filter_map(|&id| self.elements.slot(id)).collect();
-            for part in slots.chunks(TOGETHER) {
-                if stop() {
-                    return None;
+            parts.extend(slots.chunks(TOGETHER).map(<[usize]>::to_vec));
+        }
+        for n in 0..parts.len() {
+            let at = (options.first % parts.len() + n) % parts.len();
+            if stop() {
+                return Err(at);
+            }
+            let part = &parts[at];
+            let (elements, model) = (&self.elements, &self.model);
+            let spacing = elements.spacing();
+            let rules = std::array::from_fn(|c| Rules::new(&model.links, spacing, c, 1.0));
+            let sweep = Sweep { model, rules, spacing, options, tools, tiles };
+            let results: Vec<Option<Box<DisplacementBrick>>> = if part.len() > 1 {
+                part.par_iter().map(|&slot| sweep.brick(rest, elements, slot)).collect()
+            } else {
+                part.iter().map(|&slot| sweep.brick(rest, elements, slot)).collect()
+            };
+            for (&slot, result) in part.iter().zip(results) {
+                let Some(result) = result else { continue };
+                moved = true;
+                for c in 0..3 {
+                    self.before.keep(&self.elements, slot, c);
                 }
-                let (elements, model) = (&self.elements, &self.model);
-                let spacing = elements.spacing();
-                let rules = std::array::from_fn(|c| Rules::new(&model.links, spacing, c, 1.0));
-                let sweep = Sweep { model, rules, spacing, options, tools, tiles };
-                let results: Vec<Option<Box<DisplacementBrick>>> = if part.len() > 1 {
-                    part.par_iter().map(|&slot| sweep.brick(rest, elements, slot)).collect()
-                } else {
-                    part.iter().map(|&slot| sweep.brick(rest, elements, slot)).collect()
-                };
-                for (&slot, result) in part.iter().zip(results) {
-                    let Some(result) = result else { continue };
-                    moved = true;
-                    for c in 0..3 {
-                        self.before.keep(&self.elements, slot, c);
-                    }
-                    let brick = self.elements.brick_mut(slot);
-                    brick.displacement = *result;
-                    brick.measure();
-                }
+                let brick = self.elements.brick_mut(slot);
+                brick.displacement = *result;
+                brick.measure();
             }
         }
-        Some(moved)
+        Ok(moved)
     }
 
     /// The energy E [mm, in units of springs of 1/mm], over all components.

@@ -94,14 +94,9 @@ impl Visited<'_> {
                 for at in 0..EDGE {
                     let mut raises = f32x4::ZERO;
                     for lane in 0..LANES {
-                        // four elements of the face in the plane at `x` along the axis
-                        let four = |plane: &[f32; ELEMENTS], x: usize| match axis {
-                            0 => column(plane, x, (at * EDGE + 4 * lane) * EDGE),
-                            1 => row(plane, x, at)[lane],
-                            _ => row(plane, at, x)[lane],
-                        };
-                        let w = link_limits(filled(four(offset, here), rule), filled(four(o, there), rule), s);
-                        raises |= (sign * four(outside, there) - w).simd_gt(sign * four(u, here));
+                        let w =
+                            link_limits(filled(face(offset, axis, here, at, lane), rule), filled(face(o, axis, there, at, lane), rule), s);
+                        raises |= (sign * face(outside, axis, there, at, lane) - w).simd_gt(sign * face(u, axis, here, at, lane));
                     }
                     raised |= u16::from(raises.any()) << at;
                 }
@@ -133,6 +128,16 @@ pub type Side<'a> = (&'a [f32; ELEMENTS], &'a LimitsBrick);
 fn row(plane: &[f32; ELEMENTS], j: usize, k: usize) -> Row {
     let values: &[[f32; 4]; LANES] = plane.as_chunks().0[(k * EDGE + j) * LANES..].first_chunk().expect("a row of the plane");
     [f32x4::new(values[0]), f32x4::new(values[1]), f32x4::new(values[2]), f32x4::new(values[3])]
+}
+
+/// Four elements of the plane at `x` along an axis: of its row `at` (along i the rows of one k).
+#[inline(always)]
+fn face(plane: &[f32; ELEMENTS], axis: usize, x: usize, at: usize, lane: usize) -> f32x4 {
+    match axis {
+        0 => column(plane, x, (at * EDGE + 4 * lane) * EDGE),
+        1 => row(plane, x, at)[lane],
+        _ => row(plane, at, x)[lane],
+    }
 }
 
 /// Four elements at one i of the rows from `first` on.

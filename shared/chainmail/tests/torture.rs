@@ -223,3 +223,46 @@ fn one_and_two_threads_give_the_same_bits() {
     assert!(one.0.iter().map(|r| r.bricks.len()).max() > Some(40), "threads have something to share");
     assert!(one == two);
 }
+
+#[test]
+fn one_and_two_threads_give_the_same_bits_through_bone_voids_cuts_and_limits() {
+    let mut random = Random(78);
+    let rest = volume([96, 80, 64], [1.0, 0.8, 3.0], |i, j, k| {
+        if (i / 9 + j / 7 + k / 5).is_multiple_of(11) { 3000 } else { random.within(-1000.0, 2400.0) as i16 }
+    });
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let tissue = Tissue {
+                offset: 0.33,
+                threshold_hu: Some(-800.0),
+                bone_hu: Some(2500.0),
+                movement_limit_mm: Some(6.0),
+                ..Tissue::default()
+            };
+            let mut mail = ChainMail::new(rest.info(), tissue);
+            let axes = [0.9, 0.2, 0.5].map(|extension| AxisLimits { extension, compression: 0.3, shear: 0.6 });
+            mail.set_link_model(LinkModel { axes, slender: Some(Slender { thickness: 2, offset: 0.3 }), ..LinkModel::default() });
+            let mut random = Random(6);
+            let mut regions = Vec::new();
+            for n in 0..5 {
+                let mut point = || -> [f64; 3] { [random.within(20.0, 76.0), random.within(16.0, 48.0), random.within(40.0, 150.0)] };
+                regions.push(mail.cut_triangles(&rest, &swept_blade([point(), point()], [point(), point()])));
+                let held = elements_in_sphere(&rest.info().grid, point(), 3.1);
+                let motion = Motion::By([0, 1, 2].map(|_| random.within(-9.0, 9.0) as f32));
+                let pins: Vec<Pin> = held.into_iter().map(|voxel| Pin { voxel, motion }).collect();
+                let outcome = mail.push(&rest, &pins);
+                regions.push(outcome.region);
+                if n % 2 == 1 {
+                    regions.push(mail.set_threshold(&rest, [Some(-400.0), None][n / 2]));
+                }
+                let tool = Capsule { a: [40.0, 30.0, 90.0], b: [50.0, 30.0, 90.0], radius_mm: 3.0 };
+                regions.push(mail.relax_elastic(&rest, &RelaxOptions { sweeps: 1, ..RelaxOptions::default() }, &[tool], &|| false).region);
+            }
+            (regions, displacement(&mail))
+        })
+    };
+    let (one, two) = (run(1), run(2));
+    assert!(one.0.iter().map(|r| r.bricks.len()).max() > Some(24), "threads have something to share");
+    assert!(one == two);
+}

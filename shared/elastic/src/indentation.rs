@@ -164,7 +164,8 @@ impl Indentation {
 
     /// The sweeps of a setting, with the sphere held where it is.
     pub fn relax(&self, volume: &BrickedVolume, mail: &mut ChainMail, setting: &Setting) {
-        let options = RelaxOptions { sweeps: setting.sweeps, anchor: setting.anchor, snap_mm: 0.0, tools_hold_hu: Some(THRESHOLD_HU) };
+        let options =
+            RelaxOptions { sweeps: setting.sweeps, anchor: setting.anchor, snap_mm: 0.0, tools_hold_hu: Some(THRESHOLD_HU), first: 0 };
         let center = [(self.size[0] / 2) as f64, (self.size[1] / 2) as f64, (self.size[2] - 1) as f64 - self.depth + self.radius];
         let sphere = Capsule { a: center, b: center, radius_mm: self.radius };
         if setting.sweeps > 0 {
