@@ -125,7 +125,7 @@ fn every_view_shows_something() {
     let folder = Folder::new("views");
     let volume = folder.path("ball.nrrd");
     write_nrrd(&volume, |x| ball(x, [0.0; 3], 20.0).clamp(-1000.0, 300.0));
-    for view in ["3d", "axial", "coronal", "sagittal", "xray"] {
+    for view in ["3d", "axial", "coronal", "sagittal", "xray", "ultrasound"] {
         let (width, height, rgb) = picture(&volume, &folder.path("view.png"), &["--view", view, "--size", "90x70"]);
         assert_eq!(rgb.len(), 3 * width * height);
         let bright = rgb.chunks(3).filter(|p| p[0] > 40).count();

@@ -192,7 +192,7 @@ pub struct DeviceForce {
 }
 
 /// Views in a frame, in this order.
-pub const VIEWS: [&str; 4] = ["3d", "axial", "coronal", "sagittal"];
+pub const VIEWS: [&str; 5] = ["3d", "axial", "coronal", "sagittal", "ultrasound"];
 
 /// Where a view's pixels lie in a frame.
 #[repr(C)]
@@ -210,7 +210,7 @@ pub struct ViewRect {
 /// User header of a frame. Writer: rendering. Reader: console.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("maille.FrameHeader/v1")]
+#[type_name("maille.FrameHeader/v2")]
 pub struct FrameHeader {
     /// sender's stamp
     pub stamp: Stamp,
@@ -221,7 +221,7 @@ pub struct FrameHeader {
     /// time spent rendering [ns]
     pub render_ns: u64,
     /// the views, in the order of [`VIEWS`]; 0 × 0 where the scene has none
-    pub views: [ViewRect; 4],
+    pub views: [ViewRect; 5],
 }
 
 fn finite(numbers: &[f64]) -> bool {

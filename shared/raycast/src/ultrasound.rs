@@ -223,13 +223,14 @@ pub fn echoes(source: &(impl BrickSource + ?Sized), settings: &Ultrasound, warp:
             let reach = ((2.0 * sigma) as usize).min(24);
             let (mut mirror, mut speckle) = (0.0, [0.0; 2]);
             let (mut sum, mut squares) = (0.0, 0.0);
-            for other in line.saturating_sub(reach)..=(line + reach).min(lines - 1) {
-                let t = other.abs_diff(line) as f32 / sigma;
+            let first = line.saturating_sub(reach);
+            for (other, of) in cast[first..=(line + reach).min(lines - 1)].iter().enumerate() {
+                let t = (first + other).abs_diff(line) as f32 / sigma;
                 let w = (-0.5 * t * t).exp();
                 sum += w;
                 squares += w * w;
-                mirror += w * cast[other].mirror[n];
-                (0..2).for_each(|c| speckle[c] += w * cast[other].speckle[c][n]);
+                mirror += w * of.mirror[n];
+                (0..2).for_each(|c| speckle[c] += w * of.speckle[c][n]);
             }
             let rms = squares.sqrt();
             *out = (mirror / sum + speckle[0] / rms).hypot(speckle[1] / rms);

@@ -258,7 +258,14 @@ pub static EFFECTS: &[Effect] = &[
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
     Effect::later("breathing", "the patient breathes", &[]),
     Effect::later("x-ray", "a fluoroscopic view", &[]),
-    Effect::later("ultrasound", "an ultrasound view", &[]),
+    Effect {
+        processes: &[Process::Rendering],
+        stages: &[stage(Process::Rendering, "ultrasound", Per::Frame)],
+        panels: &["ultrasound"],
+        depends_on: &["contact"],
+        hard_cases: &["a probe in the air", "bone and gas before tissue", "a probe that looks nowhere"],
+        ..Effect::named("ultrasound", "what a probe at the tool's tip would see, made from CT")
+    },
     Effect::later("surfaces", "meshes extracted live", &[]),
     Effect { channels: &[&LABELS], ..Effect::later("labels", "organs by label", &[]) },
     Effect::later("recording", "a record that can be replayed", &[]),

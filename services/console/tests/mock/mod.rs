@@ -227,7 +227,7 @@ impl Feed for Mock {
             epoch: now / 100_000_000,
             view_sequence: self.view.stamp.sequence,
             render_ns: self.now_ns() - now,
-            views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2)],
+            views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2), ViewRect::default()],
         };
         show(&header, &payload);
         true
