@@ -131,6 +131,11 @@ fn every_view_shows_something() {
         let bright = rgb.chunks(3).filter(|p| p[0] > 40).count();
         assert!(bright > 200 && bright < 90 * 70, "{view}: {bright}");
     }
+    // a probe on the ball, with a little gel
+    let probe = ["--view=ultrasound", "--eye=0,-22,0", "--target=0,0,0", "--depth=40", "--size=90x70"];
+    let (_, _, rgb) = picture(&volume, &folder.path("view.png"), &probe);
+    let bright = rgb.chunks(3).filter(|p| p[0] > 40).count();
+    assert!(bright > 200 && bright < 90 * 70, "ultrasound: {bright}");
     let (_, _, rgb) = picture(&volume, &folder.path("view.png"), &["--view=axial", "--at=-30", "--size=50x50"]);
     assert!(rgb.iter().all(|&v| v < 40), "below the ball there is air");
 }

@@ -4,8 +4,8 @@ use super::{Failure, Outcome};
 use clap::{Args as ClapArgs, ValueEnum};
 use maille_phantom::{Kind, Phantom};
 use maille_raycast::{
-    Camera, Extras, Geometry, Labels, Light, MeshView, Overlay, Picture, Plane, Preset, Section, Settings, Skip, SlabMode, Step, Transfer,
-    render_extra, section_with,
+    Camera, Extras, Geometry, Labels, Light, MeshView, Overlay, Picture, Plane, Preset, Probe, Section, Settings, Skip, SlabMode, Step,
+    Transfer, Ultrasound, render_extra, section_with, ultrasound,
 };
 use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
 use maille_surface::{Mesh, read_mesh};
@@ -28,7 +28,7 @@ pub struct Args {
     /// the picture to write
     #[arg(short, long, value_name = "PNG")]
     output: PathBuf,
-    /// what to show: the 3D view, a section, or a radiograph with the camera of the 3D view
+    /// what to show: the 3D view, a section, a radiograph with the camera of the 3D view, or the fan of an ultrasound probe at the eye
     #[arg(long, value_enum, default_value_t = View::ThreeD)]
     view: View,
     /// pixels across and down [default: the scene's, or 1024x768]
@@ -98,6 +98,12 @@ struct More {
     /// a mesh among the voxels, in section views its outline: .stl, .ply or .obj, LPS millimetres; may be given several times
     #[arg(long, value_name = "MESH")]
     mesh: Vec<PathBuf>,
+    /// how deep an ultrasound probe looks [default: 120]
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    depth: Option<f64>,
+    /// frequency of an ultrasound probe [default: 3.5]
+    #[arg(long, value_name = "MHZ", value_parser = positive)]
+    frequency: Option<f64>,
     /// thickness of a section
     #[arg(long, value_name = "MM", value_parser = positive)]
     slab: Option<f64>,
@@ -114,6 +120,7 @@ enum View {
     Coronal,
     Sagittal,
     Xray,
+    Ultrasound,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -140,7 +147,7 @@ pub fn run(args: &Args) -> Outcome {
     let bricks = BrickedVolume::from_volume(&volume);
     drop(volume);
     let plane = match args.view {
-        View::ThreeD | View::Xray => None,
+        View::ThreeD | View::Xray | View::Ultrasound => None,
         View::Axial => Some(Plane::Axial),
         View::Coronal => Some(Plane::Coronal),
         View::Sagittal => Some(Plane::Sagittal),
@@ -162,6 +169,13 @@ pub fn run(args: &Args) -> Outcome {
             let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
             let overlay = Overlay { labels: labels.as_ref(), geometry: Some(&geometry), ..Overlay::default() };
             timed(frames, || pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)))
+        }
+        None if args.view == View::Ultrasound => {
+            let fan = fan(args, scene.as_ref(), &bricks)?;
+            let mut outcome = Ok(());
+            let times = timed(frames, || outcome = pool.install(|| ultrasound(&bricks, &fan, None, &mut picture)));
+            outcome.map_err(Failure::Usage)?;
+            times
         }
         None => {
             let settings = settings(args, scene.as_ref())?;
@@ -323,6 +337,16 @@ fn camera(args: &Args, scene: Option<&Scene>, bricks: &BrickedVolume) -> Result<
         Some(fault) => Err(Failure::Usage(fault)),
         None => Ok(camera),
     }
+}
+
+/// A probe whose face is at the eye and that looks at the target; the picture's right is the camera's.
+fn fan(args: &Args, scene: Option<&Scene>, bricks: &BrickedVolume) -> Result<Ultrasound, Failure> {
+    let camera = camera(args, scene, bricks)?;
+    let [forward, right, _] = camera.frame().map(Into::into);
+    let mut probe = Probe::convex(camera.eye, forward, right);
+    probe.depth_mm = args.more.depth.unwrap_or(probe.depth_mm);
+    probe.frequency_mhz = args.more.frequency.unwrap_or(probe.frequency_mhz);
+    Ok(Ultrasound::new(probe))
 }
 
 fn section_settings(args: &Args, scene: Option<&Scene>, bricks: &BrickedVolume, plane: Plane, size: [usize; 2]) -> Section {

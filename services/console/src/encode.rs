@@ -1,4 +1,4 @@
-//! One frame of four raw views → one binary message of four JPEGs, made once for all pages.
+//! One frame of raw views → one binary message of as many JPEGs, made once for all pages.
 //!
 //! Cost: about 10 ns a pixel. A view whose pixels are those of the frame before keeps its JPEG: sections that stand still
 //! cost a comparison.
@@ -21,7 +21,7 @@ pub struct Picture {
 pub struct PictureEncoder {
     quality: u8,
     number: u32,
-    views: [EncodedView; 4],
+    views: [EncodedView; 5],
 }
 
 #[derive(Default)]
@@ -91,7 +91,7 @@ mod tests {
 
     fn frame() -> (FrameHeader, Vec<u8>) {
         let rect = |offset, width, height| ViewRect { offset, width, height };
-        let views = [rect(0, 32, 24), rect(2304, 16, 8), rect(2688, 16, 8), rect(0, 0, 0)];
+        let views = [rect(0, 32, 24), rect(2304, 16, 8), rect(2688, 16, 8), rect(0, 0, 0), rect(0, 0, 0)];
         let stamp = Stamp { time_ns: 2_500_000_000, sequence: 7, incarnation: 1 };
         (
             FrameHeader { stamp, epoch: 5, view_sequence: 3, render_ns: 4_000_000, shown_ns: 0, views },
@@ -104,14 +104,14 @@ mod tests {
         let (header, payload) = frame();
         let picture = PictureEncoder::new(85).encode(&header, &payload).unwrap();
         let m = &picture.message;
-        assert_eq!(&m[..4], b"MLF1");
+        assert_eq!(&m[..4], b"MLF2");
         assert_eq!(u32::from_le_bytes(m[4..8].try_into().unwrap()), picture.number);
         assert_eq!(f64::from_le_bytes(m[8..16].try_into().unwrap()), 2.5);
         assert_eq!(f64::from_le_bytes(m[16..24].try_into().unwrap()), 5.0);
         assert_eq!(f64::from_le_bytes(m[24..32].try_into().unwrap()), 3.0);
         assert_eq!(f32::from_le_bytes(m[32..36].try_into().unwrap()), 4.0);
         let mut at = FRAME_HEADER_BYTES;
-        for v in 0..4 {
+        for v in 0..5 {
             let row = &m[40 + 8 * v..48 + 8 * v];
             let len = u32::from_le_bytes(row[4..].try_into().unwrap()) as usize;
             assert_eq!(u16::from_le_bytes(row[..2].try_into().unwrap()) as u32, header.views[v].width);

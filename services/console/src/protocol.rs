@@ -21,9 +21,9 @@
 //! | 16 | f64 | epoch of the tissue shown |
 //! | 24 | f64 | sequence of the view state shown |
 //! | 32 | f32 | time spent rendering \[ms\] |
-//! | 36 | u32 | number of views, 4 |
+//! | 36 | u32 | number of views, 5 |
 //! | 40 + 8 v | u16, u16, u32 | width, height, bytes of view v's JPEG; 0 bytes where the scene has no such view |
-//! | 72 … | | the JPEGs, one after the other, in the order 3d, axial, coronal, sagittal |
+//! | 80 … | | the JPEGs, one after the other, in the order 3d, axial, coronal, sagittal, ultrasound |
 //!
 //! Lengths are millimetres in patient coordinates (LPS), forces newtons, values HU. A message that is not understood, or
 //! whose numbers cannot be used, changes nothing and is counted.
@@ -32,11 +32,11 @@ use maille_contract::{ViewState, messages::TRANSFER_POINTS};
 use serde::{Deserialize, Serialize};
 
 /// Raised when a message changes its meaning.
-pub const PROTOCOL: u32 = 1;
-/// First four bytes of a frame: "MLF1".
-pub const FRAME_MAGIC: u32 = u32::from_le_bytes(*b"MLF1");
+pub const PROTOCOL: u32 = 2;
+/// First four bytes of a frame: "MLF2".
+pub const FRAME_MAGIC: u32 = u32::from_le_bytes(*b"MLF2");
 /// Bytes before the first JPEG.
-pub const FRAME_HEADER_BYTES: usize = 72;
+pub const FRAME_HEADER_BYTES: usize = 80;
 /// Longest message that a page may send: the largest real one is a tenth of it.
 pub const MAX_REQUEST_BYTES: usize = 16 << 10;
 

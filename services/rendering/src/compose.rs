@@ -1,8 +1,10 @@
-//! A frame: four views drawn, then laid side by side in one sample.
+//! A frame: the views drawn, then laid side by side in one sample.
 
 use crate::{overlay, view::View};
 use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
-use maille_raycast::{Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Warp, render_extra, section_with};
+use maille_raycast::{
+    Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Ultrasound, Warp, render_extra, section_with, ultrasound,
+};
 use maille_scene::Scene;
 use maille_volume::BrickSource;
 
@@ -12,7 +14,7 @@ const PLANES: [Plane; 3] = [Plane::Axial, Plane::Coronal, Plane::Sagittal];
 /// Draws frames into memory of its own.
 pub(crate) struct Composer {
     skip: Option<Skip>,
-    pictures: [Picture; 4],
+    pictures: [Picture; 5],
 }
 
 impl Composer {
@@ -20,7 +22,8 @@ impl Composer {
         let [w, h] = scene.rendering.size;
         let [sw, sh] = if scene.has_effect("sections") { scene.rendering.section_size } else { [0, 0] };
         let section = || Picture::new(sw, sh);
-        Self { skip: None, pictures: [Picture::new(w, h), section(), section(), section()] }
+        let [fw, fh] = if scene.has_effect("ultrasound") { scene.rendering.section_size } else { [0, 0] };
+        Self { skip: None, pictures: [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)] }
     }
 
     /// Bytes of a frame.
@@ -47,7 +50,7 @@ impl Composer {
             }
             empty => empty.insert(Skip::new(source, &settings)),
         };
-        let [whole, sections @ ..] = &mut self.pictures;
+        let [whole, sections @ .., fan] = &mut self.pictures;
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let bodies = Geometry { capsules: tool_body.as_slice(), meshes: &[] };
         // an endoscope does not see itself
@@ -59,6 +62,13 @@ impl Composer {
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
             let overlay = Overlay { warp, geometry: Some(&bodies), ..Overlay::default() };
             section_with(source, &Section { level, window, ..whole }, &overlay, picture);
+        }
+        if fan.width > 0 {
+            let drawn = tool.is_some_and(|tool| ultrasound(source, &Ultrasound::new(overlay::probe(tool)), warp, fan).is_ok());
+            if !drawn {
+                // no probe, or one that looks nowhere
+                fan.rgb.fill(0);
+            }
         }
         Ok(())
     }

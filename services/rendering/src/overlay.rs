@@ -3,7 +3,7 @@
 //! The ray caster draws it among the voxels: tissue that lets light through attenuates it. Frame: patient, mm.
 
 use maille_contract::{ToolState, messages::TOOL_IN_CONTACT};
-use maille_raycast::Capsule;
+use maille_raycast::{Capsule, Probe};
 
 /// Length of shaft that is drawn [mm].
 const SHAFT_MM: f64 = 180.0;
@@ -18,6 +18,15 @@ pub(crate) fn body(tool: &ToolState) -> Option<Capsule> {
     let color = if tool.flags & TOOL_IN_CONTACT != 0 { [1.0, 0.55, 0.2] } else { [0.75, 0.8, 0.88] };
     let end = std::array::from_fn(|c| tool.tip_mm[c] - tool.direction[c] / length * SHAFT_MM);
     Some(Capsule { a: tool.tip_mm, b: end, radius: tool.radius_mm, color })
+}
+
+/// The tool as an ultrasound probe; its face is held at the surface, as the hand feels it. The picture's right is that of an endoscope
+/// at the same place: nobody tells how the hand turns the probe about its axis.
+pub(crate) fn probe(tool: &ToolState) -> Probe {
+    let up = if tool.direction[2].abs() > 0.99 { [0.0, -1.0, 0.0] } else { [0.0, 0.0, 1.0] };
+    let [d, u] = [tool.direction, up];
+    let across = [d[1] * u[2] - d[2] * u[1], d[2] * u[0] - d[0] * u[2], d[0] * u[1] - d[1] * u[0]];
+    Probe::convex(tool.proxy_mm, d, across)
 }
 
 #[cfg(test)]

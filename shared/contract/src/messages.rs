@@ -196,7 +196,7 @@ pub struct DeviceForce {
 }
 
 /// Views in a frame, in this order.
-pub const VIEWS: [&str; 4] = ["3d", "axial", "coronal", "sagittal"];
+pub const VIEWS: [&str; 5] = ["3d", "axial", "coronal", "sagittal", "ultrasound"];
 
 /// Where a view's pixels lie in a frame.
 #[repr(C)]
@@ -227,7 +227,7 @@ pub struct FrameHeader {
     /// simulation time of what is shown [ns]: where a patient who breathes lay
     pub shown_ns: u64,
     /// the views, in the order of [`VIEWS`]; 0 × 0 where the scene has none
-    pub views: [ViewRect; 4],
+    pub views: [ViewRect; 5],
 }
 
 fn finite(numbers: &[f64]) -> bool {

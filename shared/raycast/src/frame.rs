@@ -148,15 +148,20 @@ impl Frame {
         }
     }
 
-    /// The ray through the centre of a pixel; its length is negative where it misses the volume.
-    pub fn ray(&self, x: usize, y: usize) -> Ray {
-        let u = x as f32 * self.scale[0] + self.shift[0];
-        let v = y as f32 * self.scale[1] + self.shift[1];
+    /// Unit direction, in the grid's axes, through a place in the picture [pixels], the centre of the first pixel being (0, 0).
+    pub fn direction(&self, x: f32, y: f32) -> [f32; 3] {
+        let u = x * self.scale[0] + self.shift[0];
+        let v = y * self.scale[1] + self.shift[1];
         let stretch = (1.0 + self.barrel * (u * u * self.aspect * self.aspect + v * v)) / (1.0 + self.barrel);
         let (u, v) = (u * stretch, v * stretch);
-        let mut direction: [f32; 3] = std::array::from_fn(|c| self.forward[c] + u * self.right[c] + v * self.down[c]);
+        let direction: [f32; 3] = std::array::from_fn(|c| self.forward[c] + u * self.right[c] + v * self.down[c]);
         let inverse_length = 1.0 / direction.iter().map(|d| d * d).sum::<f32>().sqrt();
-        direction = direction.map(|d| d * inverse_length);
+        direction.map(|d| d * inverse_length)
+    }
+
+    /// The ray through the centre of a pixel; its length is negative where it misses the volume.
+    pub fn ray(&self, x: usize, y: usize) -> Ray {
+        let direction = self.direction(x as f32, y as f32);
         let (mut enter, mut leave) = (0.0f32, f32::INFINITY);
         let mut per_mm = [0.0; 3];
         for c in 0..3 {

@@ -36,6 +36,7 @@ pub mod skip;
 #[cfg(test)]
 mod tests;
 pub mod transfer;
+pub mod ultrasound;
 mod walk;
 pub mod warp;
 
@@ -49,4 +50,5 @@ pub use section::{Overlay, Plane, Section, SlabMode, section, section_with};
 pub use settings::{Adaptive, Light, Mode, Settings, Shading, Step};
 pub use skip::{Skip, SkipUpdate};
 pub use transfer::{Preset, Transfer, TransferError};
+pub use ultrasound::{Acoustic, Echoes, Probe, Ultrasound, acoustic, echoes, ultrasound};
 pub use warp::{Moment, Motion, Warp, WarpError, WarpOptions, WarpReport};

@@ -6,6 +6,7 @@ use crate::{
     render::{Ends, Stage},
     scalar::Seen,
     walk,
+    warp::Tile,
 };
 use maille_volume::BrickSource;
 
@@ -39,6 +40,7 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
     width: Width,
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
+    mut warp: Option<&mut Tile<'_>>,
     first: [usize; 2],
     size: [usize; 2],
     put: impl FnMut(usize, usize, Seen),
@@ -51,7 +53,7 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
         {
             return tile(lanes, first, size, put, |l, x, y| {
                 // SAFETY: `lanes` is the proof that this processor has the instructions.
-                unsafe { cast_avx512(l, stage, ends, x, y) }
+                unsafe { cast_avx512(l, stage, ends, warp.as_deref_mut(), x, y) }
             });
         }
         if width == Width::Avx2
@@ -59,12 +61,12 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
         {
             return tile(lanes, first, size, put, |l, x, y| {
                 // SAFETY: `lanes` is the proof that this processor has the instructions.
-                unsafe { cast_avx2(l, stage, ends, x, y) }
+                unsafe { cast_avx2(l, stage, ends, warp.as_deref_mut(), x, y) }
             });
         }
     }
     let _ = width;
-    tile(crate::lanes::portable::Portable, first, size, put, |l, x, y| walk::cast(l, stage, ends, x, y));
+    tile(crate::lanes::portable::Portable, first, size, put, |l, x, y| walk::cast(l, stage, ends, warp.as_deref_mut(), x, y));
 }
 
 fn tile<L: Lanes>(
@@ -72,7 +74,7 @@ fn tile<L: Lanes>(
     first: [usize; 2],
     size: [usize; 2],
     mut put: impl FnMut(usize, usize, Seen),
-    cast: impl Fn(L, usize, usize) -> walk::Packet,
+    mut cast: impl FnMut(L, usize, usize) -> walk::Packet,
 ) {
     for y in (first[1]..first[1] + size[1]).step_by(L::DOWN) {
         for x in (first[0]..first[0] + size[0]).step_by(L::ACROSS) {
@@ -93,10 +95,11 @@ fn cast_avx512<S: BrickSource + ?Sized>(
     l: crate::lanes::avx512::Avx512,
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
+    warp: Option<&mut Tile<'_>>,
     x: usize,
     y: usize,
 ) -> walk::Packet {
-    walk::cast(l, stage, ends, x, y)
+    walk::cast(l, stage, ends, warp, x, y)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -105,8 +108,9 @@ fn cast_avx2<S: BrickSource + ?Sized>(
     l: crate::lanes::avx2::Avx2,
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
+    warp: Option<&mut Tile<'_>>,
     x: usize,
     y: usize,
 ) -> walk::Packet {
-    walk::cast(l, stage, ends, x, y)
+    walk::cast(l, stage, ends, warp, x, y)
 }

@@ -11,7 +11,7 @@ use crate::{
     scalar::{Caster, Seen},
     settings::{Light, Mode, Settings},
     skip::Skip,
-    warp::Warp,
+    warp::{Tile, View, Warp},
 };
 use maille_volume::BrickSource;
 use rayon::prelude::*;
@@ -88,7 +88,6 @@ pub(crate) struct Stage<'a, S: ?Sized> {
     pub frame: &'a Frame,
     pub source: &'a S,
     pub skip: &'a Skip,
-    pub warp: Option<&'a Warp>,
     pub labels: Option<&'a Labels>,
 }
 
@@ -147,7 +146,8 @@ pub fn render_extra<S: BrickSource + ?Sized>(
     let margin = extras.warp.map_or([0.0; 3], Warp::margin);
     let frame = Frame::new(source.info(), camera, settings, [width, height], extras.barrel as f32, margin);
     let caster = Caster { frame: &frame, source, skip, jumps: extras.kernel != Kernel::ScalarWithoutSkipping };
-    let stage = Stage { frame: &frame, source, skip, warp: extras.warp, labels: extras.labels };
+    let stage = Stage { frame: &frame, source, skip, labels: extras.labels };
+    let view = extras.warp.map(|w| View::new(w, &frame, [width, height]));
     let solids = extras.geometry.filter(|g| !g.is_empty());
     let solids = solids.map(|g| Solids::new(g, camera, settings, [width, height], extras.barrel as f32, BAND));
     let lanes = match extras.kernel {
@@ -161,8 +161,12 @@ pub fn render_extra<S: BrickSource + ?Sized>(
         let rows = rgb.len() / (3 * width);
         let solid = solids.as_ref().and_then(|s| s.band(n));
         let ends = solid.as_ref().map(|band| Ends { band, row: n * BAND });
+        let mut tile = view.as_ref().map(|view| Tile::new(view, [TILE, BAND]));
         for x0 in (0..width).step_by(TILE) {
             let columns = TILE.min(width - x0);
+            if let Some(tile) = &mut tile {
+                tile.begin([x0, n * BAND], [columns, rows]);
+            }
             let mut put = |x: usize, y: usize, mut seen: Seen| {
                 let at = (y - n * BAND) * width + x;
                 let mut behind = frame.background;
@@ -179,7 +183,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                 }
             };
             match lanes {
-                Some(lanes) => packet::cast_tile(lanes, &stage, ends.as_ref(), [x0, n * BAND], [columns, rows], put),
+                Some(lanes) => packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), [x0, n * BAND], [columns, rows], put),
                 None => (n * BAND..n * BAND + rows).for_each(|y| {
                     (x0..x0 + columns).for_each(|x| {
                         let end = solid.as_ref().map_or(f32::INFINITY, |band| band.depth[(y - n * BAND) * width + x]);

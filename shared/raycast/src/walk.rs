@@ -17,7 +17,7 @@ use crate::{
     scalar::{Seen, ZERO_GRADIENT},
     settings::Mode,
     skip::GENTLE,
-    warp::Bend,
+    warp::{Bend, Tile},
 };
 use maille_volume::{
     BrickSource,
@@ -181,14 +181,14 @@ fn divide<L: Lanes, const BY: usize>(l: L, v: L::Int) -> L::Int {
 }
 
 /// A packet on its way.
-struct Walker<'a, L: Lanes, S: BrickSource + ?Sized> {
+struct Walker<'a, 't, 'v, L: Lanes, S: BrickSource + ?Sized> {
     l: L,
     stage: &'a Stage<'a, S>,
     frame: &'a Frame,
     rays: Rays<L>,
     /// steps for one index step, where rays are straight
     inverse: [L::Float; 3],
-    bend: Option<Bend<'a>>,
+    bend: Option<Bend<'t, 'v, L>>,
     /// whether rays may end within the volume, at a body
     ends: bool,
     /// number of the brick in which each lane is
@@ -196,7 +196,7 @@ struct Walker<'a, L: Lanes, S: BrickSource + ?Sized> {
     voxels: [*const i16; MOST],
 }
 
-impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
+impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
     /// Cell and fractions of positions, clamped into the volume (lanes that are done may lie anywhere).
     #[inline(always)]
     fn place(&self, p: &[L::Float; 3]) -> Place<L> {
@@ -271,7 +271,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
 
     /// Gradient [stored units/mm] in the grid's axes, from the inner rows and eight outer ones.
     #[inline(always)]
-    fn gradient(&self, place: &Place<L>, inner: &Inner<L>) -> [L::Float; 3] {
+    fn gradient(&mut self, place: &Place<L>, inner: &Inner<L>, lanes: L::Mask) -> [L::Float; 3] {
         let [_, fy, fz] = place.fraction;
         let [v00, v10, v01, v11] = inner.value;
         let x = lerp(lerp(inner.dx[0], inner.dx[1], fy), lerp(inner.dx[2], inner.dx[3], fy), fz);
@@ -284,18 +284,18 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
         let far = lerp(v11 - self.row(inner, 1 + 2 * ROW), self.row(inner, 1 + 3 * SLICE + 2 * ROW) - v10, fz);
         let g = [x, y, lerp(near, far, fy)];
         let g = axes!(c => g[c] * self.l.set(self.frame.per_mm[c] * 0.5 / WEIGHT));
-        match &self.bend {
-            Some(bend) => bend.turn(self.l, &g),
+        match &mut self.bend {
+            Some(bend) => bend.turn(self.l, &g, lanes),
             None => g,
         }
     }
 
     /// Factors of colour and highlight at samples, `distance` from the eye [mm].
     #[inline(always)]
-    fn shade(&self, place: &Place<L>, inner: &Inner<L>, distance: L::Float) -> [L::Float; 2] {
+    fn shade(&mut self, place: &Place<L>, inner: &Inner<L>, distance: L::Float, lanes: L::Mask) -> [L::Float; 2] {
         let (l, frame) = (self.l, self.frame);
         let Some(shading) = frame.shading else { return [l.set(1.0), l.set(0.0)] };
-        let g = self.gradient(place, inner);
+        let g = self.gradient(place, inner, lanes);
         let light = if frame.at_eye { self.rays.direction } else { axes!(c => l.set(frame.light[c])) };
         let square = dot(&g, &g);
         let some = l.set(ZERO_GRADIENT).lt(square);
@@ -331,24 +331,17 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
     fn bent(&mut self, q: L::Float, alive: L::Mask) -> [L::Float; 3] {
         let p = self.rays.at(q);
         match &mut self.bend {
-            Some(bend) => bend.bend(self.l, q, p, alive.bits()),
+            Some(bend) => bend.bend(self.l, q, p, alive),
             None => p,
         }
     }
 
-    /// Steps from the samples at q, in empty cells of distance d, to where their boxes of empty cells end.
+    /// Steps from samples in empty cells of distance d to where their boxes of empty cells end.
     #[inline(always)]
-    fn way_out(&self, q: L::Float, d: L::Int, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
-        let l = self.l;
-        let inverse = match &self.bend {
-            Some(bend) => bend.inverse(l),
-            None => self.inverse,
-        };
-        let d = d.float();
-        let least = self.box_exit(&inverse, d, corner, p);
+    fn way_out(&self, d: L::Int, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
         match &self.bend {
-            Some(bend) => bend.way_out(l, q, least, d),
-            None => least,
+            Some(bend) => bend.way_out(self.l, d.float(), corner, p),
+            None => self.box_exit(&self.inverse, d.float(), corner, p),
         }
     }
 
@@ -408,19 +401,8 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
             }
             let q = long.fma(l.set(0.5), from);
             alive = alive & !self.rays.length.lt(q);
-            let (mut far, mut far_out) = (none, zero);
             let mut fresh = none;
-            if let Some(bend) = &self.bend {
-                // what is empty however the warp moves it is jumped over without asking the warp
-                let p = self.rays.at(q);
-                let (state, corner) = self.state(&p, distances, counts, large);
-                let d = state.float() - l.set(bend.cells());
-                far = alive & one.lt(d) & !state.eq(l.int(i32::from(GENTLE)));
-                if far.any() {
-                    far_out = self.box_exit(&self.inverse, d, &corner, &p);
-                }
-            }
-            let p = self.bent(q, alive & !far);
+            let p = self.bent(q, alive);
             let (state, corner) = self.state(&p, distances, counts, large);
             let place = self.place(&p);
             let mut empty = state.gt(l.int(0)) & !state.eq(l.int(i32::from(GENTLE)));
@@ -429,8 +411,8 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
                     let (outside, jump) = outside_lanes(l, frame, bend, &p);
                     // matter met right after what is outside is cut open, as at the start of a ray
                     fresh = edge & !outside;
-                    edge = outside & !far;
-                    empty = empty | outside | far;
+                    edge = outside;
+                    empty = empty | outside;
                     Some((outside, jump))
                 }
                 None => None,
@@ -439,9 +421,9 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
             let here = alive & !empty;
             let mut next = from;
             if (alive & empty).any() {
-                let mut out = self.way_out(q, state, &corner, &p);
+                let mut out = self.way_out(state, &corner, &p);
                 if let Some((outside, jump)) = outside {
-                    out = out.or(outside, jump).or(far, far_out);
+                    out = out.or(outside, jump);
                 }
                 // as if the ray went on by one step at a time; a hair less, so that rounding carries no sample across a wall
                 let behind = from + long.max(one);
@@ -482,7 +464,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
                     let visible = zero.lt(weight);
                     if visible.any() {
                         if frame.shading.is_some() && (visible & (weight.ge(l.set(adaptive.shade_from)) | !shaded)).any() {
-                            let [d, s] = self.shade(&place, &inner, distance);
+                            let [d, s] = self.shade(&place, &inner, distance, visible);
                             (diffuse, specular) = (diffuse.or(visible, d), specular.or(visible, s));
                             shaded = shaded | visible;
                         }
@@ -548,7 +530,7 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
         let place = self.place(&p);
         let inner = self.inner(&place);
         let distance = at.fma(l.set(frame.step), self.rays.start);
-        let [mut diffuse, mut specular] = self.shade(&place, &inner, distance);
+        let [mut diffuse, mut specular] = self.shade(&place, &inner, distance, hit);
         if let Some(shading) = frame.shading {
             diffuse = diffuse.or(cut, l.set(shading.ambient * shading.ambient_light + shading.diffuse));
             specular = specular.only(!cut);
@@ -585,11 +567,11 @@ impl<'a, L: Lanes, S: BrickSource + ?Sized> Walker<'a, L, S> {
 
 /// Which lanes the warp has taken out of the volume, and how many steps they stay outside at least.
 #[inline(always)]
-fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_>, p: &[L::Float; 3]) -> (L::Mask, L::Float) {
+fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::Float; 3]) -> (L::Mask, L::Float) {
     let mut gap = l.set(0.0);
     for (c, &p) in p.iter().enumerate() {
         let beyond = (l.set(0.0) - p).max(p - l.set(frame.last[c]));
-        gap = gap.max(beyond * l.set(1.0 / bend.speed()[c]));
+        gap = gap.max(beyond / bend.speed()[c]);
     }
     (l.set(0.0).lt(gap), gap)
 }
@@ -617,12 +599,18 @@ impl Packet {
 
 /// Walks the rays through a packet of pixels whose first is (x, y).
 #[inline(always)]
-pub fn cast<L: Lanes, S: BrickSource + ?Sized>(l: L, stage: &Stage<'_, S>, ends: Option<&Ends<'_>>, x: usize, y: usize) -> Packet {
+pub fn cast<L: Lanes, S: BrickSource + ?Sized>(
+    l: L,
+    stage: &Stage<'_, S>,
+    ends: Option<&Ends<'_>>,
+    tile: Option<&mut Tile<'_>>,
+    x: usize,
+    y: usize,
+) -> Packet {
     let frame = stage.frame;
     let first = stage.source.brick(0).voxels.as_ptr();
     let rays = Rays::new(l, frame, ends, x, y);
-    let (origin, delta) = (axes!(c => floats(l, rays.origin[c])), axes!(c => floats(l, rays.delta[c])));
-    let bend = stage.warp.map(|warp| Bend::new(warp, frame.step, origin, delta, L::COUNT));
+    let bend = tile.map(|tile| Bend::new(l, frame, tile, [x, y], rays.start, rays.delta));
     let inverse = axes!(c => l.set(1.0) / rays.delta[c]);
     Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] }.walk()
 }

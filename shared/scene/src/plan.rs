@@ -140,7 +140,8 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
 
     let pixels = |[w, h]: [usize; 2]| 3 * w * h;
     let sections = if scene.has_effect("sections") { 3 * pixels(scene.rendering.section_size) } else { 0 };
-    let frame_bytes = pixels(scene.rendering.size) + sections;
+    let fan = if scene.has_effect("ultrasound") { pixels(scene.rendering.section_size) } else { 0 };
+    let frame_bytes = pixels(scene.rendering.size) + sections + fan;
 
     let knobs = KNOBS.iter().filter(|k| effects.iter().any(|e| e.name == k.effect)).map(|k| (k, (k.get)(scene))).collect();
     let panels = if scene.console.enabled { effects.iter().flat_map(|e| e.panels).copied().collect() } else { Vec::new() };

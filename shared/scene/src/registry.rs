@@ -272,7 +272,14 @@ pub static EFFECTS: &[Effect] = &[
     Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
     Effect::later("x-ray", "a fluoroscopic view", &[]),
-    Effect::later("ultrasound", "an ultrasound view", &[]),
+    Effect {
+        processes: &[Process::Rendering],
+        stages: &[stage(Process::Rendering, "ultrasound", Per::Frame)],
+        panels: &["ultrasound"],
+        depends_on: &["contact"],
+        hard_cases: &["a probe in the air", "bone and gas before tissue", "a probe that looks nowhere"],
+        ..Effect::named("ultrasound", "what a probe at the tool's tip would see, made from CT")
+    },
     Effect::later("surfaces", "meshes extracted live", &[]),
     Effect { channels: &[&LABELS], ..Effect::later("labels", "organs by label", &[]) },
     Effect::later("recording", "a record that can be replayed", &[]),

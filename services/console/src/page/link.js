@@ -1,7 +1,8 @@
 // The socket: comes back by itself, gives texts and frames on, acknowledges a frame once it is drawn.
 
-const VIEWS = ["3d", "axial", "coronal", "sagittal"];
-const MAGIC = 0x31464c4d; // "MLF1"
+const VIEWS = ["3d", "axial", "coronal", "sagittal", "ultrasound"];
+const MAGIC = 0x32464c4d; // "MLF2"
+const HEADER = 40 + 8 * VIEWS.length;
 
 export class Link {
   constructor({ onText, onFrame, onOpen, onClose }) {
@@ -35,12 +36,12 @@ export class Link {
 // The layout is in the server's protocol.rs.
 function readFrame(buffer) {
   const d = new DataView(buffer);
-  if (buffer.byteLength < 72 || d.getUint32(0, true) !== MAGIC) return null;
+  if (buffer.byteLength < HEADER || d.getUint32(0, true) !== MAGIC) return null;
   const frame = {
     number: d.getUint32(4, true), time: d.getFloat64(8, true), epoch: d.getFloat64(16, true),
     viewSequence: d.getFloat64(24, true), renderMs: d.getFloat32(32, true), views: {},
   };
-  let at = 72;
+  let at = HEADER;
   VIEWS.forEach((name, v) => {
     const bytes = d.getUint32(44 + 8 * v, true);
     if (bytes > 0) {

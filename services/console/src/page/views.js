@@ -1,8 +1,8 @@
-// The four views: the newest picture, and over it what the page knows better than the picture (letters, lines, tool, scale).
+// The views: the newest picture, and over it what the page knows better than the picture (letters, lines, tool, scale).
 
 import { PLANES, SectionMap, CameraMap, letter, add, dot } from "/geometry.js";
 
-const TITLES = { "3d": "3D", axial: "Axial", coronal: "Coronal", sagittal: "Sagittal" };
+const TITLES = { "3d": "3D", axial: "Axial", coronal: "Coronal", sagittal: "Sagittal", ultrasound: "Ultrasound" };
 const AXIS_COLOURS = ["#e57373", "#81c784", "#64b5f6"]; // sagittal x, coronal y, axial z
 const SILENT_MS = 1000;
 
@@ -55,10 +55,14 @@ export class View {
   put(bitmap) {
     if (this.image.width !== bitmap.width || this.image.height !== bitmap.height) { this.image.width = bitmap.width; this.image.height = bitmap.height; }
     this.pixels.drawImage(bitmap, 0, 0);
+    this.element.hidden = false; // a view that few scenes have is there once it has a picture
     bitmap.close();
   }
 
-  get isSection() { return this.name !== "3d"; }
+  get isSection() { return this.name in PLANES; }
+
+  // The fan of a probe: nothing is drawn over it, and the mouse does nothing in it.
+  get isFan() { return this.name === "ultrasound"; }
 
   // Mapping between patient and the picture's pixels.
   map() {
@@ -101,6 +105,7 @@ export class View {
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, box.width, box.height);
     g.font = "600 12px system-ui, sans-serif";
+    if (this.isFan) return void this.title.replaceChildren(TITLES[this.name]);
     const map = this.map();
     const screen = ([x, y]) => [(x + 0.5) * scale + left, (y + 0.5) * scale + top];
     if (this.isSection) { this.lines(g, map, screen, box); this.scaleBar(g, scale / map.mm, box); }

@@ -234,7 +234,7 @@ impl Feed for Mock {
             view_sequence: self.view.stamp.sequence,
             render_ns: self.now_ns() - now,
             shown_ns: now,
-            views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2)],
+            views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2), ViewRect::default()],
         };
         show(&header, &payload);
         true

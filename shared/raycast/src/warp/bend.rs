@@ -1,144 +1,214 @@
-//! A packet of rays on their way through a warp: straight in rest space from knot to knot.
+//! A packet of rays on their way through a warp: X = x + a + s (b + s c), s = 0…1 from one plane of the view to the next.
 //!
-//! Between the knots q₀ and q₁ [steps along the ray] X = x + v₀ + (q − q₀)(v₁ − v₀)/(q₁ − q₀). Knots are read lane by lane when a
-//! lane has passed its last one: lanes walk at their own pace, and one lookup for each costs what one for all together would.
-//! Gradients turn with the warp: ∇ₓ f(X(x)) = (1 + ∂v/∂x)ᵀ ∇f, the derivative taken at the knot ahead.
+//! The parabola of a lane is read when it comes into another slab between planes, for all lanes of the packet that are there.
+//! Gradients turn with the warp: ∇ₓ f(X(x)) = (1 + ∂v/∂x)ᵀ ∇f, the derivative at the packet's middle, linear in s.
+//!
+//! How far a lane may jump in rest space out of a box of empty cells: its straight continuation is off by c Δs² at most within the slab, by
+//! half the largest bending times length² beyond it. So within the slab the box is smaller by |c|; beyond, by whole cells, and the jump
+//! ends where bending could have used them up.
 
-use super::lattice::Warp;
+use super::{lattice::Warp, tile::Tile};
 use crate::{
-    frame::TINY,
-    lanes::{Float, Lanes, MOST, Mask},
+    frame::{Frame, TINY},
+    lanes::{Float, Int, Lanes, MOST, Mask},
     walk::axes,
 };
 use maille_volume::brick::CELL;
+use wide::f32x4;
 
-type Row = [f32; MOST];
+/// Parabolas are continued a little before their slab, where a hit is refined.
+const BEFORE: f32 = -0.3;
 
-/// Knots of every lane.
-pub(crate) struct Bend<'a> {
-    warp: &'a Warp,
-    step: f32,
-    origin: [Row; 3],
-    delta: [Row; 3],
-    /// last knot and next one [steps]
-    from: Row,
-    until: Row,
-    /// v at the last knot, and its change a step [index]
-    offset: [Row; 3],
-    slope: [Row; 3],
-    inverse: [Row; 3],
-    /// distance from the next knot to the one after it [steps]
-    reach: Row,
-    /// ∂v_c/∂x_d at row 3c + d, in millimetres
-    turn: [Row; 9],
+/// Parabolas of every lane.
+pub(crate) struct Bend<'t, 'v, L: Lanes> {
+    tile: &'t mut Tile<'v>,
+    pixel: [usize; 2],
+    /// slabs a step, and slab coordinate at q = 0
+    rate: L::Float,
+    base: L::Float,
+    delta: [L::Float; 3],
+    /// slab of each lane
+    slab: L::Float,
+    a: [L::Float; 3],
+    b: [L::Float; 3],
+    c: [L::Float; 3],
+    /// s of the last samples
+    local: L::Float,
+    /// slab that `turn` is of
+    turned: L::Float,
+    /// ∂v_c/∂x_d at row 3 d + c, and its change over the slab
+    turn: [[L::Float; 9]; 2],
     /// no axis moves faster than this [index per step]
-    speed: [f32; 3],
+    speed: [L::Float; 3],
+    /// largest bending of rays [index per step²]
+    bending: f32,
 }
 
-impl<'a> Bend<'a> {
-    pub fn new(warp: &'a Warp, step: f32, origin: [Row; 3], delta: [Row; 3], lanes: usize) -> Self {
-        let speed = std::array::from_fn(|c| {
-            let fastest = |n: usize| delta[c][n].abs() + (0..3).map(|d| warp.steepest()[c][d] * delta[d][n].abs()).sum::<f32>();
-            (0..lanes).map(fastest).fold(0.0, f32::max)
-        });
+impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
+    /// For the rays of a packet whose first pixel is `pixel`; `start`: distance from the eye at q = 0 [mm].
+    #[inline(always)]
+    pub fn new(l: L, frame: &Frame, tile: &'t mut Tile<'v>, pixel: [usize; 2], start: L::Float, delta: [L::Float; 3]) -> Self {
+        let view = tile.view;
+        let rate = frame.step / view.apart;
+        let zero = l.set(0.0);
         Self {
-            warp,
-            step,
-            origin,
+            pixel,
+            rate: l.set(rate),
+            base: (start - l.set(view.first)) * l.set(1.0 / view.apart),
             delta,
-            from: [0.0; MOST],
-            until: [f32::NEG_INFINITY; MOST],
-            offset: [[0.0; MOST]; 3],
-            slope: [[0.0; MOST]; 3],
-            inverse: [[0.0; MOST]; 3],
-            reach: [0.0; MOST],
-            turn: [[0.0; MOST]; 9],
-            speed,
+            slab: l.set(-1e9),
+            a: [zero; 3],
+            b: [zero; 3],
+            c: [zero; 3],
+            local: zero,
+            turned: l.set(-1e9),
+            turn: [[zero; 9]; 2],
+            speed: axes!(d => delta[d].abs() + l.set(view.steepest[d] * frame.step)),
+            bending: view.bending * frame.step * frame.step,
+            tile,
         }
     }
 
     /// Bound on the speed in rest space [index per step].
-    pub fn speed(&self) -> [f32; 3] {
-        self.speed
+    #[inline(always)]
+    pub fn speed(&self) -> &[L::Float; 3] {
+        &self.speed
     }
 
     /// Rest positions of samples at q, whose world positions are p.
     #[inline(always)]
-    pub fn bend<L: Lanes>(&mut self, l: L, q: L::Float, p: [L::Float; 3], lanes: u32) -> [L::Float; 3] {
-        let mut passed = q.ge(l.load(&self.until)).bits() & lanes;
-        if passed != 0 {
-            let mut at = [0.0; MOST];
-            l.store(q, &mut at);
-            while passed != 0 {
-                let lane = passed.trailing_zeros() as usize;
-                self.knot(lane, at[lane]);
-                passed &= passed - 1;
+    pub fn bend(&mut self, l: L, q: L::Float, p: [L::Float; 3], lanes: L::Mask) -> [L::Float; 3] {
+        let s = q.fma(self.rate, self.base);
+        let mut local = s - self.slab;
+        let left = lanes & (local.lt(l.set(BEFORE)) | local.ge(l.set(1.0)));
+        if left.any() {
+            self.enter(l, s, left);
+            local = s - self.slab;
+        }
+        self.local = local;
+        axes!(d => p[d] + local.fma(local.fma(self.c[d], self.b[d]), self.a[d]))
+    }
+
+    /// Reads the slabs into which lanes have come.
+    #[inline(always)]
+    fn enter(&mut self, l: L, s: L::Float, mut left: L::Mask) {
+        let numbers = s.whole().max(l.int(0)).min(l.int(self.tile.last_slab() as i32));
+        let mut each = [0; MOST];
+        l.store_int(numbers, &mut each);
+        while left.any() {
+            let number = each[left.bits().trailing_zeros() as usize];
+            let here = left & numbers.eq(l.int(number));
+            self.tile.fill(number as usize);
+            let (corner, place, width) = self.tile.corners(number as usize, self.pixel);
+            let across = l.load(&std::array::from_fn(|n| place[0] + (n % L::ACROSS) as f32 * width));
+            let down = l.load(&std::array::from_fn(|n| place[1] + (n / L::ACROSS) as f32 * width));
+            self.slab = self.slab.or(here, l.set(number as f32));
+            macro_rules! read {
+                ($field:ident, $m:expr) => {
+                    let [p, q, r, t] = [corner[0][$m], corner[1][$m], corner[2][$m], corner[3][$m]];
+                    let (x, y, both): ([f32; 4], [f32; 4], [f32; 4]) = ((q - p).to_array(), (r - p).to_array(), (t - q - r + p).to_array());
+                    let p = p.to_array();
+                    for d in 0..3 {
+                        let first = across.fma(l.set(x[d]), l.set(p[d]));
+                        let slope = across.fma(l.set(both[d]), l.set(y[d]));
+                        self.$field[d] = self.$field[d].or(here, down.fma(slope, first));
+                    }
+                };
             }
-        }
-        let along = q - l.load(&self.from);
-        axes!(c => p[c] + along.fma(l.load(&self.slope[c]), l.load(&self.offset[c])))
-    }
-
-    /// Cells by which the warp may move anything.
-    #[inline(always)]
-    pub fn cells(&self) -> f32 {
-        self.warp.cells()
-    }
-
-    /// Moves a lane's knots so that q lies between them.
-    #[inline(always)]
-    fn knot(&mut self, lane: usize, q: f32) {
-        let place = |q: f32| [0, 1, 2].map(|c| self.delta[c][lane] * q + self.origin[c][lane]);
-        let contiguous = q < self.until[lane] + self.reach[lane];
-        let (from, until, after, offset, slope, turn);
-        if contiguous {
-            let length = self.until[lane] - self.from[lane];
-            from = self.until[lane];
-            until = from + self.reach[lane];
-            offset = [0, 1, 2].map(|c| self.slope[c][lane] * length + self.offset[c][lane]);
-            let next;
-            (next, after, turn) = self.warp.offset_and_turn(place(until));
-            slope = [0, 1, 2].map(|c| (next[c] - offset[c]) / self.reach[lane]);
-        } else {
-            // after a jump: along the tangent, half as far, which errs as much and takes one look
-            let near;
-            (offset, near, turn) = self.warp.offset_and_turn(place(q));
-            from = q;
-            until = q + 0.5 * near / self.step;
-            after = near;
-            slope = self.warp.along(&turn, [0, 1, 2].map(|c| self.delta[c][lane]));
-        }
-        (self.from[lane], self.until[lane], self.reach[lane]) = (from, until, after / self.step);
-        for c in 0..3 {
-            self.offset[c][lane] = offset[c];
-            self.slope[c][lane] = slope[c];
-            let moved = self.delta[c][lane] + slope[c];
-            self.inverse[c][lane] = 1.0 / if moved.abs() < TINY { TINY } else { moved };
-        }
-        for (row, t) in self.turn.iter_mut().zip(turn) {
-            row[lane] = t;
+            read!(a, 0);
+            read!(b, 1);
+            read!(c, 2);
+            left = left & !here;
         }
     }
 
-    /// Steps for one index step in rest space, up to the next knot.
+    /// Steps that rays surely stay in the box of empty cells around rest positions p: the box reaches d − 1 cells beyond their cell.
     #[inline(always)]
-    pub fn inverse<L: Lanes>(&self, l: L) -> [L::Float; 3] {
-        axes!(c => l.load(&self.inverse[c]))
-    }
-
-    /// Steps out of an empty box that a straight ray would leave after `least`: no further than the next knot, unless the bound
-    /// on the speed allows more. `d`: the box reaches d − 1 cells beyond its cell on every side.
-    #[inline(always)]
-    pub fn way_out<L: Lanes>(&self, l: L, q: L::Float, least: L::Float, d: L::Float) -> L::Float {
-        let fastest = self.speed[0].max(self.speed[1]).max(self.speed[2]);
-        let sure = (d - l.set(1.0)) * l.set(CELL as f32 / fastest);
-        least.min(l.load(&self.until) - q).max(sure)
+    pub fn way_out(&self, l: L, d: L::Float, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
+        let zero = l.set(0.0);
+        let rest = (l.set(1.0) - self.local).max(zero);
+        // a third of the cells is left to bending
+        let spare = (d * l.set(0.34)).whole().float();
+        let (mut within, mut beyond) = (l.set(f32::INFINITY), l.set(f32::INFINITY));
+        for n in 0..3 {
+            let slope = (self.local + self.local).fma(self.c[n], self.b[n]);
+            let speed = slope.fma(self.rate, self.delta[n]);
+            let at_end = (rest + rest).fma(self.c[n] * self.rate, speed);
+            let speed = speed.or(speed.abs().lt(l.set(TINY)), l.set(TINY));
+            let inverse = l.set(1.0) / speed;
+            let (low, high) = ((corner[n] + l.set(1.0) - d) * l.set(CELL as f32), (corner[n] + d) * l.set(CELL as f32));
+            let wall = low.or(zero.lt(speed), high);
+            let way = (wall - p[n]) * inverse;
+            let off = self.c[n].abs();
+            // a ray that turns round within the slab goes |c| at most either way
+            let turns = (speed * at_end).lt(zero);
+            let room = (p[n] - low).min(high - p[n]);
+            let turned = zero.or(off.lt(room), l.set(f32::INFINITY));
+            within = within.min((way - off * inverse.abs()).max(zero).or(turns, turned));
+            beyond = beyond.min(way - spare * l.set(CELL as f32) * inverse.abs());
+        }
+        // ½ bending · length² = spare cells
+        let reach = (spare * l.set(2.0 * CELL as f32 / self.bending)).sqrt();
+        within.min(rest / self.rate).max(beyond.min(reach))
     }
 
     /// A gradient of rest space [per mm along the grid's axes], as world space sees it.
     #[inline(always)]
-    pub fn turn<L: Lanes>(&self, l: L, g: &[L::Float; 3]) -> [L::Float; 3] {
-        let t = &self.turn;
-        axes!(d => g[0].fma(l.load(&t[d]), g[1].fma(l.load(&t[3 + d]), g[2].fma(l.load(&t[6 + d]), g[d]))))
+    pub fn turn(&mut self, l: L, g: &[L::Float; 3], lanes: L::Mask) -> [L::Float; 3] {
+        let mut other = lanes & (self.turned.lt(self.slab) | self.slab.lt(self.turned));
+        if other.any() {
+            let mut each = [0.0; MOST];
+            l.store(self.slab, &mut each);
+            while other.any() {
+                let number = each[other.bits().trailing_zeros() as usize].max(0.0);
+                let wanted = l.set(number);
+                let here = other & !(self.slab.lt(wanted) | wanted.lt(self.slab));
+                let middle = [self.pixel[0] as f32 + 0.5 * (L::ACROSS as f32 - 1.0), self.pixel[1] as f32 + 0.5 * (L::DOWN as f32 - 1.0)];
+                let turns: [[f32x4; 3]; 2] = self.tile.turns(number as usize, middle);
+                for (rows, turns) in self.turn.iter_mut().zip(turns) {
+                    for (d, turn) in turns.into_iter().enumerate() {
+                        let t = turn.to_array();
+                        for c in 0..3 {
+                            rows[3 * d + c] = rows[3 * d + c].or(here, l.set(t[c]));
+                        }
+                    }
+                }
+                self.turned = self.turned.or(here, wanted);
+                let rest = other & !here;
+                if rest.bits() == other.bits() {
+                    break;
+                }
+                other = rest;
+            }
+        }
+        let [t, change] = &self.turn;
+        let s = self.local;
+        axes!(d => g[0].fma(s.fma(change[3 * d], t[3 * d]), g[1].fma(s.fma(change[3 * d + 1], t[3 * d + 1]), g[2].fma(s.fma(change[3 * d + 2], t[3 * d + 2]), g[d]))))
+    }
+}
+
+impl Warp {
+    /// Bound on what a picture's own lattice adds to the error of rest positions [mm]; see [`WarpReport`](super::WarpReport) for the rest of it.
+    ///
+    /// # Errors
+    /// As of a picture with this camera and these settings.
+    pub fn view_error_mm(
+        &self,
+        info: &maille_volume::VolumeInfo,
+        camera: &crate::Camera,
+        settings: &crate::Settings,
+        size: [usize; 2],
+        barrel: f64,
+    ) -> Result<f32, crate::RenderError> {
+        if let Some(fault) = camera.fault() {
+            return Err(crate::RenderError::Camera(fault));
+        }
+        if !self.suits(info) || size.contains(&0) {
+            return Err(crate::RenderError::Extras(
+                "the warp was made for another volume, or never updated, or the picture is empty".into(),
+            ));
+        }
+        let frame = Frame::new(info, camera, settings, size, barrel as f32, self.margin());
+        Ok(super::view::View::new(self, &frame, size).error_mm)
     }
 }

@@ -1,11 +1,11 @@
-//! The inverse on a lattice over the volume, and how straight it is.
+//! The inverse on a lattice over the volume, cubic between its nodes.
 //!
 //! Nodes lie `pitch` apart in the volume's index space, from a margin below the volume to one above it. The lattice is
 //! refined, up to `finest`, while its error is above the tolerance.
 
 use super::field::{Lazy, Motion, WarpError, Whole};
 use maille_displacement::{Inverter, RowField, Scheme};
-use maille_volume::{Grid, VolumeInfo, brick::CELL};
+use maille_volume::{Grid, VolumeInfo};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use wide::f32x4;
@@ -17,23 +17,19 @@ pub struct WarpOptions {
     pub tolerance_mm: f32,
     /// distance of the lattice's nodes [mm]
     pub pitch_mm: f32,
-    /// longest way between two knots of a ray [mm]
-    pub longest_mm: f32,
 }
 
 impl Default for WarpOptions {
     fn default() -> Self {
-        Self { tolerance_mm: 0.05, pitch_mm: 4.0, longest_mm: 16.0 }
+        Self { tolerance_mm: 0.05, pitch_mm: 8.0 }
     }
 }
 
 /// What an update found.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WarpReport {
-    /// bound on a sample's distance from its true rest position [mm]: lattice and knots together
+    /// bound on a position's distance from its true rest position [mm]; a 3D picture adds [`Warp::view_error_mm`]
     pub error_mm: f32,
-    /// the lattice's part of it
-    pub lattice_mm: f32,
     /// mean of the lattice's error over its cells [mm]
     pub mean_mm: f32,
     /// contraction of u that the bound rests on
@@ -46,15 +42,11 @@ pub struct WarpReport {
     pub nodes: usize,
 }
 
-/// Nodes along the edge of a block that has one distance of knots.
-const BLOCK: usize = 4;
 /// Nodes inverted at once.
 const ROW: usize = 16;
 /// Most nodes of a lattice (64 MiB): one that would have more, since matter leaves the volume by many times its size, is coarser, and says so
 /// in its error.
 const MOST_NODES: f64 = (4 << 20) as f64;
-/// Knots are never closer [mm].
-const CLOSEST_MM: f32 = 0.5;
 
 /// The inverse of a motion at one moment.
 #[derive(Clone, Debug)]
@@ -68,20 +60,11 @@ pub struct Warp {
     pitch: [f32; 3],
     /// its inverse
     per_pitch: [f32; 3],
-    /// slope of v's component c [index per node] along an axis ↦ derivative in millimetres
-    turn_scale: [[f32; 3]; 3],
     counts: [usize; 3],
     /// v [index]
     nodes: Vec<f32x4>,
-    blocks: [usize; 3],
-    /// distance of knots [mm], one a block
-    reach: Vec<f32>,
-    /// largest |∂v_c/∂x_d| [index per index]
-    steepest: [[f32; 3]; 3],
     /// how far matter may leave the volume [index]
     margin: [f32; 3],
-    /// see [`Warp::cells`]
-    cells: f32,
     collapsed: Vec<f32x4>,
     warm: bool,
 }
@@ -96,14 +79,9 @@ impl Warp {
             origin: [0.0; 3],
             pitch: [1.0; 3],
             per_pitch: [1.0; 3],
-            turn_scale: [[1.0; 3]; 3],
             counts: [0; 3],
             nodes: Vec::new(),
-            blocks: [0; 3],
-            reach: Vec::new(),
-            steepest: [[0.0; 3]; 3],
             margin: [0.0; 3],
-            cells: 0.0,
             collapsed: Vec::new(),
             warm: false,
         }
@@ -114,20 +92,9 @@ impl Warp {
         self.margin
     }
 
-    pub(super) fn steepest(&self) -> &[[f32; 3]; 3] {
-        &self.steepest
-    }
-
-    /// Cells of the skip map by which anything may be moved, rounded up.
-    pub(super) fn cells(&self) -> f32 {
-        self.cells
-    }
-
-    /// Change of v [index] for a step along a ray [index], by a derivative in millimetres.
-    #[inline(always)]
-    pub(super) fn along(&self, turn: &[f32; 9], delta: [f32; 3]) -> [f32; 3] {
-        let mm = [0, 1, 2].map(|d| delta[d] * self.spacing[d]);
-        [0, 1, 2].map(|c| (turn[3 * c] * mm[0] + turn[3 * c + 1] * mm[1] + turn[3 * c + 2] * mm[2]) / self.spacing[c])
+    /// The error that was allowed [mm].
+    pub(super) fn tolerance_mm(&self) -> f32 {
+        self.options.tolerance_mm
     }
 
     /// Whether it was made for a volume of this size and has been updated.
@@ -189,12 +156,9 @@ impl Warp {
         let coarser = (nodes / MOST_NODES).cbrt().max(1.0) as f32;
         self.pitch = std::array::from_fn(|c| coarser * self.options.pitch_mm / self.spacing[c]);
         self.per_pitch = self.pitch.map(|p| 1.0 / p);
-        self.turn_scale = std::array::from_fn(|d| std::array::from_fn(|c| self.spacing[c] / (self.pitch[d] * self.spacing[d])));
         self.origin = self.margin.map(|m| -m);
-        self.counts = std::array::from_fn(|c| ((lengths[c] / self.pitch[c]).ceil() as usize + 1).max(2));
-        self.blocks = self.counts.map(|n| n.div_ceil(BLOCK));
+        self.counts = std::array::from_fn(|c| ((lengths[c] / self.pitch[c]).ceil() as usize + 1).max(4));
         self.nodes = vec![f32x4::ZERO; self.counts.iter().product()];
-        self.reach = vec![CLOSEST_MM; self.blocks.iter().product()];
         self.warm = false;
     }
 
@@ -244,11 +208,8 @@ impl Warp {
         let (worst, sum) = self.residuals(frames, field);
         let bound = 1.0 / (1.0 - q);
         let cells = self.counts.iter().map(|n| n - 1).product::<usize>();
-        let lattice_mm = worst * bound;
-        let knots_mm = self.straightness();
         WarpReport {
-            error_mm: lattice_mm + knots_mm,
-            lattice_mm,
+            error_mm: worst * bound,
             mean_mm: (sum / cells as f64) as f32 * bound,
             contraction,
             unsettled,
@@ -260,24 +221,14 @@ impl Warp {
     /// Largest and summed residual [mm] at the middles of cells.
     fn residuals(&self, frames: &Frames, field: &(impl RowField + Sync)) -> (f32, f64) {
         let [nx, ny, nz] = self.counts;
-        let steps = [1, nx, nx * ny];
-        let eighth = f32x4::splat(0.125);
         (0..(ny - 1) * (nz - 1))
             .into_par_iter()
             .map(|row| {
                 let (j, k) = (row % (ny - 1), row / (ny - 1));
-                let at = (k * ny + j) * nx;
-                let face = |i: usize| {
-                    let n = at + i;
-                    self.nodes[n] + self.nodes[n + steps[1]] + self.nodes[n + steps[2]] + self.nodes[n + steps[1] + steps[2]]
-                };
                 let (mut worst, mut sum) = (0.0f32, 0.0f64);
-                let mut left = face(0);
                 for i in 0..nx - 1 {
-                    let right = face(i + 1);
-                    let v = (left + right) * eighth;
-                    left = right;
                     let world = [i, j, k].map(|n| n as f32 + 0.5);
+                    let v = self.cubic(world);
                     let x = frames.field_index(std::array::from_fn(|c| world[c] * self.pitch[c] + self.origin[c]));
                     let rest = x + frames.field_vector(v);
                     let r = frames.length_mm(x - rest - field.value(rest));
@@ -289,130 +240,42 @@ impl Warp {
             .reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1 + b.1))
     }
 
-    /// Distances of knots from second differences, and the largest slopes; the error between knots that is left [mm].
-    fn straightness(&mut self) -> f32 {
-        let [nx, ny, nz] = self.counts;
-        let [bx, by, bz] = self.blocks;
-        let nodes = &self.nodes;
-        let spacing = f32x4::new([self.spacing[0], self.spacing[1], self.spacing[2], 0.0]);
-        let pitch_mm: [f32; 3] = std::array::from_fn(|c| self.pitch[c] * self.spacing[c]);
-        // per block: the largest second derivative [1/mm], slopes [index per index] and length [index]
-        let found: Vec<(f32, [f32x4; 3], f32x4)> = (0..bx * by * bz)
-            .into_par_iter()
-            .map(|b| {
-                let first = [b % bx, b / bx % by, b / (bx * by)].map(|c| c * BLOCK);
-                let (mut curve, mut slope, mut length) = (f32x4::ZERO, [f32x4::ZERO; 3], f32x4::ZERO);
-                for k in first[2]..(first[2] + BLOCK).min(nz) {
-                    for j in first[1]..(first[1] + BLOCK).min(ny) {
-                        for i in first[0]..(first[0] + BLOCK).min(nx) {
-                            let n = (k * ny + j) * nx + i;
-                            let here = nodes[n];
-                            length = length.fast_max(here.abs());
-                            let inner = [i, j, k];
-                            let steps = [1, nx, nx * ny];
-                            // |dᵀ H d| ≤ √(Σ_ab H_ab²) for a unit direction d
-                            let mut sum = f32x4::ZERO;
-                            for a in 0..3 {
-                                if inner[a] + 1 < self.counts[a] {
-                                    let ahead = nodes[n + steps[a]] - here;
-                                    slope[a] = slope[a].fast_max(ahead.abs());
-                                    if inner[a] > 0 {
-                                        let second = ahead - (here - nodes[n - steps[a]]);
-                                        let h = second * f32x4::splat(1.0 / (pitch_mm[a] * pitch_mm[a]));
-                                        sum += h * h;
-                                    }
-                                    let b = (a + 1) % 3;
-                                    if inner[b] + 1 < self.counts[b] {
-                                        let mixed = nodes[n + steps[a] + steps[b]] - nodes[n + steps[b]] - ahead;
-                                        let h = mixed * f32x4::splat(1.0 / (pitch_mm[a] * pitch_mm[b]));
-                                        sum += h * h + h * h;
-                                    }
-                                }
-                            }
-                            curve = curve.fast_max(sum);
-                        }
-                    }
-                }
-                let [x, y, z, _] = (curve.sqrt() * spacing).to_array();
-                ((x * x + y * y + z * z).sqrt(), slope, length)
-            })
-            .collect();
-        let longest = found.iter().fold(f32x4::ZERO, |l, f| l.fast_max(f.2)).to_array();
-        // a hair more, for what lies between nodes' rounding
-        self.cells = (longest[0].max(longest[1]).max(longest[2]) * 1.001 / CELL as f32).ceil();
-        self.steepest = [[0.0; 3]; 3];
-        for (_, slope, _) in &found {
-            for (d, slope) in slope.iter().enumerate() {
-                let s = slope.to_array();
-                (0..3).for_each(|c| self.steepest[c][d] = self.steepest[c][d].max(s[c] / self.pitch[d]));
-            }
-        }
-        // half of the tolerance is the knots'; a knot looks no further than the next block
-        let tolerance = 0.5 * self.options.tolerance_mm;
-        let furthest = self.options.longest_mm.min(pitch_mm[0].min(pitch_mm[1]).min(pitch_mm[2]) * BLOCK as f32);
-        let mut error = 0.0f32;
-        for b in 0..found.len() {
-            let at = [b % bx, b / bx % by, b / (bx * by)];
-            let mut curve = 0.0f32;
-            for k in at[2].saturating_sub(1)..(at[2] + 2).min(bz) {
-                for j in at[1].saturating_sub(1)..(at[1] + 2).min(by) {
-                    for i in at[0].saturating_sub(1)..(at[0] + 2).min(bx) {
-                        curve = curve.max(found[(k * by + j) * bx + i].0);
-                    }
-                }
-            }
-            let reach = (8.0 * tolerance / curve.max(1e-12)).sqrt().clamp(CLOSEST_MM, furthest);
-            self.reach[b] = reach;
-            error = error.max(reach * reach * curve / 8.0);
-        }
-        error
+    /// v [index] at a position of world space [index]: cubic (Lagrange) in the 4³ nodes around it, beyond the lattice as on its border.
+    #[inline]
+    pub(super) fn offset_four(&self, at: [f32; 3]) -> f32x4 {
+        self.cubic(std::array::from_fn(|c| (at[c] - self.origin[c]) * self.per_pitch[c]))
     }
 
-    /// Offset of a node of the lattice's cell around a position, and where in it.
+    /// The same at a place among the nodes.
     #[inline(always)]
-    fn locate(&self, at: [f32; 3]) -> (usize, usize, [f32; 3]) {
-        let (mut cell, mut fraction) = ([0usize; 3], [0.0; 3]);
-        for c in 0..3 {
-            let t = ((at[c] - self.origin[c]) * self.per_pitch[c]).max(0.0);
-            cell[c] = (t as usize).min(self.counts[c] - 2);
-            fraction[c] = (t - cell[c] as f32).min(1.0);
-        }
-        let block = ((cell[2] / BLOCK) * self.blocks[1] + cell[1] / BLOCK) * self.blocks[0] + cell[0] / BLOCK;
-        ((cell[2] * self.counts[1] + cell[1]) * self.counts[0] + cell[0], block, fraction)
-    }
-
-    /// v [index] at a position of world space [index], and how far it is straight [mm].
-    #[inline(always)]
-    pub(super) fn offset(&self, at: [f32; 3]) -> ([f32; 3], f32) {
-        let (v, reach, _) = self.offset_and_turn(at);
-        (v, reach)
-    }
-
-    /// The same, with ∂v_c/∂x_d along the axes in millimetres, row-major.
-    #[inline(always)]
-    pub(super) fn offset_and_turn(&self, at: [f32; 3]) -> ([f32; 3], f32, [f32; 9]) {
-        let (n, block, [x, y, z]) = self.locate(at);
+    fn cubic(&self, at: [f32; 3]) -> f32x4 {
+        let mut first = [0usize; 3];
+        let weights: [[f32; 4]; 3] = std::array::from_fn(|c| {
+            let held = at[c].max(0.0).min((self.counts[c] - 1) as f32);
+            // at the border the same four nodes as one cell further in
+            first[c] = (held as usize).saturating_sub(1).min(self.counts[c] - 4);
+            super::tile::cubic(held - first[c] as f32 - 1.0)
+        });
         let (row, slice) = (self.counts[0], self.counts[0] * self.counts[1]);
-        let corner: [f32x4; 8] = std::array::from_fn(|m| self.nodes[n + (m & 1) + (m >> 1 & 1) * row + (m >> 2) * slice]);
-        let mix = |a: f32x4, b: f32x4, t: f32| a + (b - a) * f32x4::splat(t);
-        let d: [f32x4; 4] = std::array::from_fn(|m| corner[2 * m + 1] - corner[2 * m]);
-        let e: [f32x4; 4] = std::array::from_fn(|m| corner[2 * m] + d[m] * f32x4::splat(x));
-        let (g0, g1) = (mix(e[0], e[1], y), mix(e[2], e[3], y));
-        let slopes = [mix(mix(d[0], d[1], y), mix(d[2], d[3], y), z), mix(e[1] - e[0], e[3] - e[2], z), g1 - g0];
-        let mut turn = [0.0; 9];
-        for (axis, slope) in slopes.into_iter().enumerate() {
-            let s = slope.to_array();
-            for c in 0..3 {
-                turn[3 * c + axis] = s[c] * self.turn_scale[axis][c];
+        let corner = (first[2] * self.counts[1] + first[1]) * row + first[0];
+        let x = weights[0].map(f32x4::splat);
+        let mut sum = f32x4::ZERO;
+        for (k, weight) in weights[2].iter().enumerate() {
+            let mut plane = f32x4::ZERO;
+            for (j, w) in weights[1].iter().enumerate() {
+                let at = corner + k * slice + j * row;
+                let n = &self.nodes[at..at + 4];
+                let line = n[0] * x[0] + n[1] * x[1] + (n[2] * x[2] + n[3] * x[3]);
+                plane = line.mul_add(f32x4::splat(*w), plane);
             }
+            sum = plane.mul_add(f32x4::splat(*weight), sum);
         }
-        let [i, j, k, _] = mix(g0, g1, z).to_array();
-        ([i, j, k], self.reach[block], turn)
+        sum
     }
 
     /// Rest position [index] of a position in world space [index].
     pub fn rest_index(&self, world: [f32; 3]) -> [f32; 3] {
-        let (v, _) = self.offset(world);
+        let v = self.offset_four(world).to_array();
         std::array::from_fn(|c| world[c] + v[c])
     }
 }

@@ -1,0 +1,167 @@
+//! What a warp costs and errs: a frame through a breath of three fields over the same picture baked, the bound on the error beside the error
+//! itself, and the picture beside the one of the volume resampled finely.
+//!
+//! ```text
+//! cargo run --release -p maille-raycast --example warp -- VOLUME [NODES] [FINER]
+//! ```
+//! `NODES`: nodes of the fields along each axis (64). `FINER`: voxels of the baked volume for each of the file's, along each axis (2).
+//! Times are the best of frames taken in turns, on two threads; a loaded machine disturbs ratios less than times.
+
+use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Step, Warp, WarpOptions, render, render_extra};
+use maille_volume::{BrickSource as _, BrickedVolume, Grid, Sampler, VectorField, Volume, io::read_volume};
+use rayon::prelude::*;
+use std::{path::Path, time::Instant};
+
+const SIZE: [usize; 2] = [1224, 1014];
+const ROUNDS: usize = 7;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().collect();
+    let number = |n: usize, other: usize| arguments.get(n).map_or(other, |a| a.parse().expect("a whole number"));
+    let (nodes, finer) = (number(2, 64), number(3, 2));
+    let file = arguments.get(1).expect("a volume");
+    let source = BrickedVolume::from_volume(&read_volume(Path::new(file)).expect("a readable volume").0);
+    let grid = source.info().grid.clone();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().expect("threads");
+    pool.install(|| compare(&source, &grid, nodes, finer));
+}
+
+fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
+    let motion = breath(grid, nodes);
+    let moment = |t: f32| [9.0 * t.sin(), 3.0 * t.cos(), 3.0 * (t + 0.5).sin()];
+    let mut warp = Warp::new(source.info(), WarpOptions::default());
+    let mut report = warp.update(source.info(), &motion, &moment(1.2)).expect("three coefficients");
+    let (mut update, mut t) = (f64::INFINITY, 1.2);
+    for _ in 0..ROUNDS {
+        t -= 0.03;
+        let start = Instant::now();
+        report = warp.update(source.info(), &motion, &moment(t)).expect("three coefficients");
+        update = update.min(start.elapsed().as_secs_f64() * 1e3);
+    }
+    let coefficients = moment(t);
+    let camera = Camera::around(source.info());
+    let settings = Settings { step: Step::Millimetres(1.0), ..Settings::volume(Preset::Ct.transfer()) };
+    let view_mm = warp.view_error_mm(source.info(), &camera, &settings, SIZE, 0.0).expect("a sound camera");
+
+    // the truth: the fixed point to the last digit
+    let at = motion.moment(&coefficients).expect("three coefficients");
+    let rest = |x: [f64; 3]| -> [f64; 3] {
+        let start = warp.rest_index(grid.index_from_world(x).map(|v| v as f32)).map(f64::from);
+        let mut rest = grid.world_from_index(start);
+        for _ in 0..60 {
+            let moved = at.moved(rest);
+            let off: [f64; 3] = std::array::from_fn(|c| x[c] - moved[c]);
+            rest = std::array::from_fn(|c| rest[c] + off[c]);
+            if off.iter().all(|c| c.abs() < 1e-5) {
+                break;
+            }
+        }
+        rest
+    };
+    let mut state = 1u64;
+    let mut random = || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 40) as f64 / (1u64 << 24) as f64
+    };
+    let places: Vec<[f64; 3]> =
+        (0..200_000).map(|_| grid.world_from_index(std::array::from_fn(|c| random() * (grid.size[c] - 1) as f64))).collect();
+    let worst = places
+        .par_iter()
+        .map(|&x| {
+            let (truth, found) =
+                (rest(x), grid.world_from_index(warp.rest_index(grid.index_from_world(x).map(|v| v as f32)).map(f64::from)));
+            (0..3).map(|c| (truth[c] - found[c]).powi(2)).sum::<f64>().sqrt()
+        })
+        .reduce(|| 0.0, f64::max);
+
+    // baked: resampled, with room for what leaves the volume; a ray then begins where a warped one does
+    let room: [f64; 3] = std::array::from_fn(|c| (1.25 * (15.0 / grid.spacing[c] + 1.0)).ceil());
+    let mut fine = Grid::axis_aligned(
+        std::array::from_fn(|c| (grid.size[c] - 1 + 2 * room[c] as usize) * finer + 1),
+        grid.spacing.map(|s| s / finer as f64),
+    );
+    fine.direction = grid.direction;
+    fine.origin = grid.world_from_index(room.map(|r| -r));
+    let sampler = Sampler::new(source);
+    let (nx, slice) = (fine.size[0], fine.size[0] * fine.size[1]);
+    let mut voxels = vec![0i16; fine.voxel_count()];
+    voxels.par_chunks_mut(slice).enumerate().for_each(|(k, plane)| {
+        for (n, voxel) in plane.iter_mut().enumerate() {
+            let x = fine.world_from_index([(n % nx) as f64, (n / nx) as f64, k as f64]);
+            *voxel = sampler.value(rest(x)).unwrap_or(-1024.0).round() as i16;
+        }
+    });
+    let baked = BrickedVolume::from_volume(&Volume::new(fine, maille_volume::Rescale::IDENTITY, voxels));
+    let (skip, skip_baked) = (Skip::new(source, &settings), Skip::new(&baked, &settings));
+    let (mut moved, mut still, mut unwarped) =
+        (Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]));
+    let mut times = [f64::INFINITY; 3];
+    for _ in 0..ROUNDS {
+        let mut time = |n: usize, start: Instant| times[n] = times[n].min(start.elapsed().as_secs_f64() * 1e3);
+        let start = Instant::now();
+        let extras = Extras { warp: Some(&warp), ..Extras::default() };
+        render_extra(&extras, source, &skip, &camera, &settings, &mut moved).expect("a sound camera");
+        time(0, start);
+        let start = Instant::now();
+        render(&baked, &skip_baked, &camera, &settings, &mut still).expect("a sound camera");
+        time(1, start);
+        let start = Instant::now();
+        render(source, &skip, &camera, &settings, &mut unwarped).expect("a sound camera");
+        time(2, start);
+    }
+    let difference = |a: &Picture, b: &Picture| {
+        a.rgb.iter().zip(&b.rgb).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / a.rgb.len() as f64 / 2.55
+    };
+    println!(
+        "three fields of {nodes}³: update {update:.1} ms, warped frame {:.1} ms, baked {:.1} ms, at rest {:.1} ms",
+        times[0], times[1], times[2]
+    );
+    println!(
+        "with the update {:.2} times the baked frame, {:.2} times the frame at rest",
+        (times[0] + update) / times[1],
+        (times[0] + update) / times[2]
+    );
+    println!(
+        "error at most {:.3} mm (patient's lattice {:.3}, mean {:.4}; the picture's {view_mm:.3}); of 200 000 places the worst has {worst:.4} mm from the patient's lattice",
+        report.error_mm + view_mm,
+        report.error_mm,
+        report.mean_mm
+    );
+    println!(
+        "mean difference from the picture of the volume resampled {finer} times as finely: {:.2} % of full scale; from the one at rest {:.2} %",
+        difference(&moved, &still),
+        difference(&moved, &unwarped)
+    );
+    let save = std::env::var("MAILLE_SAVE").ok();
+    for (name, picture) in [("warped", &moved), ("baked", &still)] {
+        if let Some(folder) = &save {
+            let mut bytes = format!("P6 {} {} 255\n", SIZE[0], SIZE[1]).into_bytes();
+            bytes.extend(&picture.rgb);
+            std::fs::write(Path::new(folder).join(format!("{name}.ppm")), bytes).expect("a picture");
+        }
+    }
+}
+
+/// Swelling, sliding and bending, fading towards the border.
+fn breath(grid: &Grid, nodes: usize) -> Motion {
+    let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64);
+    let mut own = Grid::axis_aligned([nodes; 3], extent.map(|e| e / (nodes - 1) as f64));
+    (own.origin, own.direction) = (grid.origin, grid.direction);
+    let center = grid.center();
+    let field = |of: fn([f64; 3], f64) -> [f64; 3]| {
+        let mut field = VectorField::zeros(own.clone());
+        for (n, v) in field.vectors.iter_mut().enumerate() {
+            let x = own.world_from_index([(n % nodes) as f64, (n / nodes % nodes) as f64, (n / (nodes * nodes)) as f64]);
+            let t: [f64; 3] = std::array::from_fn(|c| 2.0 * (x[c] - center[c]) / extent[c]);
+            let fade = t.iter().map(|t| (1.0 - t * t).max(0.0).powi(2)).product();
+            *v = of(t, fade).map(|c| c as f32);
+        }
+        field
+    };
+    Motion::new(&[
+        field(|_, f| [0.0, 0.3 * f, f]),
+        field(|t, f| [f * (2.0 * t[2]).sin(), f, 0.0]),
+        field(|t, f| [f * t[0], f * t[1], f * (2.0 * t[1]).cos()]),
+    ])
+    .expect("finite fields on one grid")
+}
