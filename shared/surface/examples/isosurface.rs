@@ -1,11 +1,12 @@
-//! Time of marching cubes on a volume file: flat and out of bricks, best and median of several runs on two threads, and processor time over
-//! two. `cargo run --release -p maille-surface --example isosurface -- VOLUME [ISO]`; the peer is FlyingEdges with normals, two threads,
+//! Time of marching cubes on a volume file: flat, out of bricks and on the smooth function, best and median of several runs on two threads, and processor time over
+//! two. `cargo run --release -p maille-surface --example isosurface -- VOLUME [ISO [FOLDER]]`, which then writes meshes; the peer is FlyingEdges with normals, two threads,
 //! on the same file.
 
-use maille_surface::{Border, marching_cubes, marching_cubes_bricks};
+use maille_surface::{Border, Mesh, marching_cubes, marching_cubes_bricks, marching_cubes_vif, write_ply};
+use maille_vif::{Voxels, Window};
 use maille_volume::{BrickedVolume, io::read_volume};
 use rustix::time::{ClockId, clock_gettime};
-use std::{path::PathBuf, time::Instant};
+use std::{fs::File, io::BufWriter, path::PathBuf, time::Instant};
 
 fn times(name: &str, mut f: impl FnMut() -> usize) {
     let used = || {
@@ -34,5 +35,16 @@ fn main() {
     pool.install(|| {
         times("flat", || marching_cubes(&volume, iso).triangles.len());
         times("bricks", || marching_cubes_bricks(&bricks, iso, Border::Open).triangles.len());
+        let smooth = |per_voxel| marching_cubes_vif(&Voxels(&bricks), Window::Five, iso, per_voxel, Border::Open).expect("a resolution");
+        times("smooth function", || smooth(1.0).triangles.len());
+        // for the eye: the voxels' mesh and the function's, at zoom
+        if let Some(folder) = std::env::args().nth(3).map(PathBuf::from) {
+            let write = |name: &str, mesh: &Mesh| {
+                let file = BufWriter::new(File::create(folder.join(name)).expect("the folder can be written to"));
+                write_ply(mesh, file).expect("the file can be written");
+            };
+            write("voxels.ply", &marching_cubes_bricks(&bricks, iso, Border::Open));
+            write("function.ply", &smooth(2.0));
+        }
     });
 }

@@ -1,6 +1,6 @@
 //! Marching cubes on the continuous function: closed, of the right genus, nearer to the truth than the voxels' mesh, and glTF files.
 
-use maille_surface::{Border, Mesh, ResolutionError, marching_cubes, marching_cubes_vif, write_glb};
+use maille_surface::{Border, Mesh, ResolutionError, decimate, marching_cubes, marching_cubes_vif, write_glb};
 use maille_testkit::{ScalarFunction, Sphere, Torus};
 use maille_vif::{Octree, Options, Tolerance, Voxels, Window};
 use maille_volume::{BrickedVolume, Grid, Rescale, Volume};
@@ -165,4 +165,28 @@ fn glb_holds_the_mesh_and_turns_the_patient_upright() {
             .fold(if c == 0 { f32::MAX } else { f32::MIN }, |a, b| if c == 0 { a.min(b) } else { a.max(b) });
         assert_eq!(json["accessors"][0][end][0].as_f64().unwrap() as f32, truth);
     }
+}
+
+#[test]
+fn a_thinned_mesh_stays_closed_and_near() {
+    for (name, shape, euler) in shapes() {
+        let mut volume = imaged(&*shape, [42, 40, 40], 0.0);
+        // far from the origin, as patients are
+        volume.info.grid.origin[2] += 1500.0;
+        let bricks = BrickedVolume::from_volume(&volume);
+        let mut mesh = marching_cubes_vif(&Voxels(&bricks), Window::One, 500.0, 1.0, Border::Open).unwrap();
+        let wanted = mesh.triangles.len() / 5;
+        let mut thin = decimate(&mesh, wanted).unwrap();
+        assert_eq!(euler_of_closed(&thin), euler, "{name}");
+        assert!(thin.triangles.len() <= wanted + 2 && thin.triangles.len() > wanted / 2);
+        for m in [&mut mesh, &mut thin] {
+            m.positions.iter_mut().for_each(|p| p[2] -= 1500.0);
+        }
+        let (distance, angle) = errors(&thin, &*shape);
+        println!("{name}: {} to {} triangles, {distance:.3} mm and {angle:.1}° off", mesh.triangles.len(), thin.triangles.len());
+        assert!(distance < 0.1 && angle < 8.0, "{name}: {distance} mm, {angle}°");
+        assert!((thin.volume() / mesh.volume() - 1.0).abs() < 0.03);
+        assert_eq!(decimate(&thin, 1_000_000).unwrap(), thin);
+    }
+    assert_eq!(decimate(&Mesh::default(), 0).unwrap(), Mesh::default());
 }

@@ -1,9 +1,9 @@
 //! Times and sizes of the octree: built out of bricks at 128³ to 512³ from the real head upsampled (trilinear), and from the real
-//! thorax as it is. `cargo run --release -p maille-vif --example octree [-- FOLDER-OF-DATA]`.
+//! thorax as it is; incisions into the head. `cargo run --release -p maille-vif --example octree [-- FOLDER-OF-DATA]`.
 //!
 //! Best and median of several builds on two threads, and processor time over two; one plain reading of the bricks' voxels beside it, for what memory allows.
 
-use maille_vif::{Octree, Options, Tolerance};
+use maille_vif::{Incision, Octree, Options, Tolerance, Tool, carve};
 use maille_volume::{BrickSource, BrickedVolume, Grid, Rescale, Sampler, Volume, io::read_volume};
 use rayon::prelude::*;
 use rustix::time::{ClockId, clock_gettime};
@@ -82,6 +82,35 @@ fn report(name: &str, bricks: &BrickedVolume, repeats: usize) {
     );
 }
 
+/// Incisions of 4×4×4 voxels: the cut itself, the refit of what they touch, and taking both back.
+fn incisions(bricks: &BrickedVolume) {
+    let mut volume = bricks.clone();
+    let mut octree = Octree::build(&volume, Options::default()).expect("the options are right");
+    let size = bricks.info().grid.size;
+    let [mut cut, mut refit, mut undo] = [(); 3].map(|()| Vec::new());
+    for n in 0..200usize {
+        let place = |c: usize, step: f64| 4.0 + (size[c] as f64 - 8.0) * (n as f64 * step).fract();
+        let center = [place(0, 0.754_877_67), place(1, 0.569_840_29), place(2, 0.438_579_1)];
+        let incision = Incision::new(&volume.info().grid, Tool::Box([4; 3]), center).expect("inside");
+        let begin = Instant::now();
+        let carved = carve(&mut volume, &incision, -1000.0);
+        let carved_at = begin.elapsed();
+        let (low, high) = incision.bounds();
+        let before = octree.refit(&volume, low, high);
+        let refitted_at = begin.elapsed();
+        octree.undo(before);
+        carved.undo(&mut volume);
+        let end = begin.elapsed();
+        for (list, time) in [(&mut cut, carved_at), (&mut refit, refitted_at - carved_at), (&mut undo, end - refitted_at)] {
+            list.push(time.as_secs_f64() * 1e3);
+        }
+    }
+    for (name, list) in [("cut", &mut cut), ("refit", &mut refit), ("undo", &mut undo)] {
+        list.sort_by(f64::total_cmp);
+        println!("incision of 4×4×4, {name}: p50 {:.3} ms, p99 {:.3} ms", list[100], list[198]);
+    }
+}
+
 fn main() {
     let data = std::env::args().nth(1).map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().expect("two threads can be had");
@@ -89,6 +118,7 @@ fn main() {
         let read = |name: &str| read_volume(&data.join(name)).unwrap_or_else(|e| panic!("{e}; give the folder of data as argument")).0;
         let head = BrickedVolume::from_volume(&read("ct_head_invesalius/cranium_lps.nrrd"));
         report("head as it is", &head, 9);
+        incisions(&head);
         for n in [128, 256, 384, 512] {
             report(&format!("head at {n}³"), &BrickedVolume::from_volume(&upsampled(&head, n)), 7);
         }
