@@ -45,6 +45,10 @@ const POLL: Duration = Duration::from_millis(2);
 /// Shortest time between relaxation steps, and how long no push may have come before the first [ns].
 const RELAX_NS: u64 = 33_000_000;
 
+/// How long sweeps of relaxation may go on before what has moved is mapped and shown [ns]: half of the time between steps, so that the other
+/// half is left for that. Large dents need several batches a sweep.
+const LONGEST_BATCH_NS: u64 = RELAX_NS / 2;
+
 /// The epoch that shows the volume at rest.
 const FIRST_EPOCH: u64 = 1;
 
@@ -107,7 +111,8 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
                 last_step = now;
                 let held: Vec<Capsule> =
                     tool.iter().map(|t| Capsule { a: t.tip_reference_mm, b: t.tip_reference_mm, radius_mm: t.radius_mm }).collect();
-                let stop = || moves.is_waiting();
+                // a push is answered at once, and what has moved so far is shown while pictures are still fluid
+                let stop = || moves.is_waiting() || monotonic_ns() > now + LONGEST_BATCH_NS;
                 if let Some(done) = engine.relax(now, 2 * RELAX_NS, &held, &stop, &reader, &mut writer) {
                     announcer.step(&mut life, &done, now, None);
                     continue;

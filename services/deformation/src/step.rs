@@ -260,9 +260,14 @@ impl Engine {
     ) -> Option<Done> {
         let dt_s = now_ns.saturating_sub(self.state.last_step_ns).min(longest_ns) as f64 * 1e-9;
         self.state.last_step_ns = now_ns;
-        let region = match self.relax.as_ref()? {
-            Relax::Decay(time_s) => self.mail.relax((-dt_s / time_s).exp() as f32, SNAP_MM),
-            Relax::Elastic(options) => self.mail.relax_elastic(&reader.rest(), options, tools, stop).region,
+        let region = match self.relax.as_mut()? {
+            Relax::Decay(time_s) => self.mail.relax((-dt_s / *time_s).exp() as f32, SNAP_MM),
+            Relax::Elastic(options) => {
+                let relaxed = self.mail.relax_elastic(&reader.rest(), options, tools, stop);
+                // what was stopped goes on there; a process that starts anew begins at the first brick again
+                options.first = if relaxed.sweeps == 0 { relaxed.next } else { 0 };
+                relaxed.region
+            }
         };
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))
     }
