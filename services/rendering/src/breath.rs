@@ -23,6 +23,8 @@ pub(crate) struct Breather<'a> {
     collapsed: Collapsed,
     warp: Warp,
     report: WarpReport,
+    /// what a picture's own lattice may add [mm]: half of the warp's tolerance
+    view_mm: f32,
 }
 
 impl<'a> Breather<'a> {
@@ -30,11 +32,12 @@ impl<'a> Breather<'a> {
     pub fn new(patient: Patient<'a>, info: &VolumeInfo, tolerance_mm: f64) -> Self {
         let extent = |c: usize| info.grid.size[c] as f64 * info.grid.spacing[c];
         let nodes = |pitch: f32| (0..3).map(|c| extent(c) / f64::from(pitch) + 4.0).product::<f64>();
-        // the way between knots takes half of what it is given: a third of the whole, as the lattice's share is the dearer
-        let options = |pitch_mm| WarpOptions { tolerance_mm: 0.66 * tolerance_mm as f32, pitch_mm, ..WarpOptions::default() };
+        // a picture's own lattice takes half of what it is given: a third of the whole, as the patient's share is the dearer
+        let within_mm = 0.66 * tolerance_mm as f32;
+        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm, ..WarpOptions::default() };
         let collapsed = Collapsed::new(patient.model(), tolerance_mm as f32);
         let warp = Warp::new(info, options(PITCHES_MM[0]));
-        let mut breather = Self { patient, info: info.clone(), collapsed, warp, report: WarpReport::default() };
+        let mut breather = Self { patient, info: info.clone(), collapsed, warp, report: WarpReport::default(), view_mm: 0.5 * within_mm };
         // between nodes closer than the fields' own there is nothing to be found but their kinks
         let finest = breather.patient.model().grid().min_spacing() as f32;
         let tried = |&pitch: &f32| nodes(pitch) <= MOST_NODES && (pitch >= finest || pitch >= PITCHES_MM[0]);
@@ -42,7 +45,7 @@ impl<'a> Breather<'a> {
             breather.warp = Warp::new(info, options(pitch));
             // both ends of a breath; deepest first, so that the lattice has room for all that follows
             let usual = [Breath { level: 1.0, rate: 0.0, phase: 0.0 }, Breath::EXPIRED, Breath { level: 0.5, rate: -0.8, phase: 0.25 }];
-            let worst = usual.map(|breath| drawn_off_mm(&breather.bend(breath))).into_iter().fold(0.0, f32::max);
+            let worst = usual.map(|breath| drawn_off_mm(&breather.bend(breath), breather.view_mm)).into_iter().fold(0.0, f32::max);
             if f64::from(worst) <= tolerance_mm {
                 break;
             }
@@ -71,15 +74,14 @@ impl<'a> Breather<'a> {
 
     /// What the last frame's warp is worth: how far from its place anything is drawn [mm], and nodes without a rest position.
     pub fn report(&self) -> (f64, u64) {
-        (drawn_off_mm(&self.report).into(), self.report.unsettled as u64)
+        (drawn_off_mm(&self.report, self.view_mm).into(), self.report.unsettled as u64)
     }
 }
 
 /// How far from where it is anything is drawn [mm]: what is shown at x is X, whose place is X + u(X). That is the residual itself, at its worst in the
-/// middle of the lattice's cells, and the bend between knots; whatever the contraction, by which the report bounds the error in X.
-fn drawn_off_mm(report: &WarpReport) -> f32 {
-    let knots = report.error_mm - report.lattice_mm;
-    report.lattice_mm * (1.0 - report.contraction.clamp(0.01, 0.95)) + knots
+/// middle of the lattice's cells, and what the picture's own lattice adds; whatever the contraction, by which the report bounds the error in X.
+fn drawn_off_mm(report: &WarpReport, view_mm: f32) -> f32 {
+    report.error_mm * (1.0 - report.contraction.clamp(0.01, 0.95)) + view_mm
 }
 
 #[cfg(test)]
@@ -147,7 +149,8 @@ mod tests {
         let seen_from_below = drawn(&scene, &reader, None, -8.0);
         let differ = |a: &[u8], b: &[u8]| a.iter().zip(b).filter(|(a, b)| a.abs_diff(**b) > 24).count() as f64 / a.len() as f64;
         let (off_mm, unsettled) = breather.report();
-        assert!(unsettled == 0 && off_mm < 0.01, "{off_mm} {unsettled}");
+        // the lattice is exact; what is left is the share of the tolerance that a picture may take
+        assert!(unsettled == 0 && off_mm < 0.033 + 1e-3, "{off_mm} {unsettled}");
         assert!(differ(&before, &still) < 0.001, "before the command nothing moves: {}", differ(&before, &still));
         // what samples along a ray begin at differs; edges of a pixel
         let (same, other) = (differ(&moved, &seen_from_below), differ(&moved, &still));
