@@ -67,8 +67,8 @@ impl<'a> Breather<'a> {
     fn bend(&mut self, breath: Breath) -> WarpReport {
         let model = self.patient.model();
         let weights = model.weights(&breath);
-        let (longest_mm, contraction) = model.bounds(&weights);
         self.collapsed.collapse(model, &weights);
+        let (longest_mm, contraction) = self.collapsed.bounds(model);
         self.warp.update_field(&self.info, model.grid(), &self.collapsed.displacement(), longest_mm, contraction)
     }
 

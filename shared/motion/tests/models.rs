@@ -126,6 +126,29 @@ fn the_collapsed_inverse_follows_breathing_and_stays_an_inverse() {
 }
 
 #[test]
+fn bounds_of_a_sum_are_those_of_its_nodes_and_below_those_of_its_terms() {
+    let model = surrogate(Precision::F32);
+    let weights = model.weights(&Breath { level: 0.9, rate: -0.7, phase: 0.2 });
+    let mut collapsed = Collapsed::new(&model, 0.01);
+    collapsed.collapse(&model, &weights);
+    let (longest, contraction) = collapsed.bounds(&model);
+    let u = sum(&truth(&grid()), [0.9, -0.7]);
+    let exact = u.vectors.iter().map(|v| v.iter().map(|c| c * c).sum::<f32>().sqrt()).fold(0.0, f32::max);
+    assert!((longest - exact).abs() < 2e-3, "{longest} {exact}");
+    let (length_of_terms, contraction_of_terms) = model.bounds(&weights);
+    assert!(longest <= length_of_terms + 1e-3 && contraction <= contraction_of_terms + 1e-3 && contraction > 0.05);
+    // what it promises: neighbours nowhere further apart
+    let at = MotionAt::new(&model, weights);
+    let axes = grid().direction_matrix().transpose();
+    for x in points(400) {
+        let y = grid().world_from_index(grid().index_from_world(x).map(|i| i + 0.4));
+        let apart = |a: [f64; 3], b: [f64; 3]| (axes * (Vector3::from(a) - Vector3::from(b))).amax();
+        let (dx, du) = (apart(x, y), apart(at.displacement_mm(x), at.displacement_mm(y)));
+        assert!(du <= f64::from(contraction) * dx * 1.001 + 1e-4, "{du} {dx} {contraction}");
+    }
+}
+
+#[test]
 fn bytes_hold_the_model_in_place_and_damage_is_refused() {
     for precision in [Precision::F32, Precision::F16, Precision::I16] {
         let model = surrogate(precision);

@@ -105,6 +105,36 @@ impl Collapsed {
         Nodes { shape: &self.shape, nodes: &self.forward, scale: self.forward_scale }
     }
 
+    /// Length of the longest vector of u [mm], and its contraction: the largest row sum of |∂u_c/∂X_d| between neighbours, along the grid's axes in
+    /// millimetres. Of the sum itself, where [`MotionModel::bounds`] adds up those of its terms.
+    pub fn bounds(&self, model: &MotionModel) -> (f32, f32) {
+        let [nx, ny, nz] = self.size;
+        let spacing = model.grid.spacing.map(|s| s as f32);
+        let at = |n: usize| self.forward[n].map(|c| f32::from(c) * self.forward_scale);
+        let step =
+            |a: [f32; 4], b: [f32; 4], d: usize| -> [f32; 3] { std::array::from_fn(|c| (b[c] - a[c]).abs() * spacing[c] / spacing[d]) };
+        let larger = |a: (f32, f32), b: (f32, f32)| (a.0.max(b.0), a.1.max(b.1));
+        let slice = |k: usize| {
+            let mut found = (0.0f32, 0.0f32);
+            for (j, i) in (0..ny).flat_map(|j| (0..nx).map(move |i| (j, i))) {
+                let n = (k * ny + j) * nx + i;
+                let here = at(n);
+                let length2: f32 = (0..3).map(|c| (here[c] * spacing[c]).powi(2)).sum();
+                let mut rows = [0.0f32; 3];
+                for (d, (inside, next)) in [(i + 1 < nx, 1), (j + 1 < ny, nx), (k + 1 < nz, nx * ny)].into_iter().enumerate() {
+                    if inside {
+                        let by = step(here, at(n + next), d);
+                        (0..3).for_each(|c| rows[c] += by[c]);
+                    }
+                }
+                found = larger(found, (length2, rows[0].max(rows[1]).max(rows[2])));
+            }
+            found
+        };
+        let (length2, contraction) = (0..nz).into_par_iter().map(slice).reduce(|| (0.0, 0.0), larger);
+        (length2.sqrt(), contraction)
+    }
+
     fn invert(&mut self) -> CollapseReport {
         // who wants u alone has no memory for this
         self.inverse.resize(self.forward.len(), [0; 4]);
