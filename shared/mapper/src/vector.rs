@@ -273,7 +273,7 @@ mod tests {
 
     #[test]
     fn gathered_words_hold_a_voxel_and_the_next() {
-        let voxels: Vec<i16> = (0..50).map(|n| n * 1009 - 20_000).collect();
+        let voxels: Vec<i16> = (0..50).map(|n: i32| (n * 1009 - 20_000) as i16).collect();
         let places = [48, 0, 7, 31];
         let words = places.map(|at: usize| i32::from(voxels[at]) & 0xffff | i32::from(voxels[at + 1]) << 16);
         assert_eq!(widest(Gather(&voxels, [48, 0, 7, 31])), words);
