@@ -2,7 +2,7 @@
 
 use crate::{overlay, view::View};
 use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
-use maille_raycast::{Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Warp, render_extra, section_with};
+use maille_raycast::{Capsule, Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Warp, render_extra, section_with};
 use maille_scene::Scene;
 use maille_volume::BrickSource;
 
@@ -37,6 +37,7 @@ impl Composer {
         view: &View,
         tool: Option<&ToolState>,
         held: bool,
+        needle: Option<&[Capsule]>,
     ) -> Result<(), RenderError> {
         let (camera, at_tip) = view.camera(tool);
         let settings = view.settings(at_tip);
@@ -49,7 +50,8 @@ impl Composer {
         };
         let [whole, sections @ ..] = &mut self.pictures;
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
-        let bodies = Geometry { capsules: tool_body.as_slice(), meshes: &[] };
+        let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
+        let bodies = Geometry { capsules, meshes: &[] };
         // an endoscope does not see itself
         let extras = Extras { warp, geometry: Some(&bodies).filter(|_| !at_tip), ..Extras::default() };
         render_extra(&extras, source, skip, &camera, &settings, whole)?;
