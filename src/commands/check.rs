@@ -60,6 +60,10 @@ pub fn run(args: &Args) -> Outcome {
     for (name, meaning, bytes) in breath.iter().flat_map(Prepared::segments) {
         plan.add_region(name, meaning, bytes);
     }
+    let labels = maille_supervisor::needle::labels_bytes(&scene);
+    if labels > 0 {
+        plan.add_region("region-labels", "labels at rest", labels);
+    }
     let way = scene.resolve_path(&BoxMm::of(grid), |at| patient.value(at)).map_err(report)?;
     let memory = Memory::of(&plan, patient.info());
     if args.json {

@@ -18,6 +18,7 @@ use maille_contact::{DevicePose, TickOutputs, moving::MovingTissue};
 use maille_contract::{ControlBlock, ToolState};
 use maille_motion::{MotionAt, model::rotation_of};
 use nalgebra::{Quaternion, Rotation3, UnitQuaternion, Vector3};
+use std::cell::Cell;
 
 type V3 = Vector3<f64>;
 
@@ -119,11 +120,41 @@ impl<'a> Breather<'a> {
         moment
     }
 
+    /// The field of a moment, for a needle; and the place in the breath.
+    pub fn field(&self, now_ns: u64) -> (Field<'_>, f64) {
+        (Field { at: self.patient.at(now_ns), residual_mm: Cell::new(None) }, self.patient.breath(now_ns).phase)
+    }
+
     /// A contact that a process which died has left, as the core wants it: tip and proxy at rest [mm].
     pub fn resume(&self, last: &ToolState) -> ([f64; 3], [f64; 3]) {
         let at = self.patient.at(last.stamp.time_ns);
         let proxy = at.to_reference(last.proxy_mm, last.proxy_mm);
         (last.tip_reference_mm, proxy.reference)
+    }
+}
+
+/// The breathing field as a needle asks it.
+pub(crate) struct Field<'m> {
+    at: MotionAt<'m>,
+    /// what the last inversion left [mm]; none: there was none, or no rest position was found
+    pub residual_mm: Cell<Option<f64>>,
+}
+
+impl maille_needle::Breathing for Field<'_> {
+    fn displacement(&self, reference: [f64; 3]) -> [f64; 3] {
+        self.at.displacement_mm(reference)
+    }
+
+    fn gradient(&self, reference: [f64; 3]) -> [[f64; 3]; 3] {
+        let g = self.at.gradient(reference);
+        std::array::from_fn(|c| std::array::from_fn(|d| g[(c, d)]))
+    }
+
+    fn to_reference(&self, world: [f64; 3], guess: [f64; 3]) -> [f64; 3] {
+        let found = self.at.to_reference(world, guess);
+        self.residual_mm.set(found.converged.then_some(found.residual_mm));
+        // the needle goes on from what it had where nothing is found
+        if found.converged { found.reference } else { guess }
     }
 }
 

@@ -11,6 +11,7 @@
 
 mod breath;
 mod device;
+mod needle;
 mod operator;
 mod outbox;
 mod publisher;
@@ -62,7 +63,7 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
     // nothing is mapped, and nothing of it runs, in a scene that does not breathe
     let mut regions = maille_breathing::Regions::open(&domain, &scene)?;
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
-    let mut tick = tick::Loop::new(&scene, &reader, patient, outbox, publisher.thread().clone())?;
+    let mut tick = tick::Loop::new(&domain, &scene, &reader, patient, outbox, publisher.thread().clone())?;
 
     let notices = enter_realtime(scene.haptic.priority.clamp(1, 99) as i32, scene.haptic.cpu);
     for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {

@@ -60,6 +60,11 @@ impl Operator {
         matches!(self.holder, Holder::External)
     }
 
+    /// Whether nobody holds the tool: it is the page's, and the page has let go.
+    pub fn is_let_go(&self) -> bool {
+        !self.follow_script && self.page.is_none() && matches!(self.holder, Holder::Script)
+    }
+
     /// Orientation of the tool, where a device knows it.
     pub fn orientation(&self) -> Option<[f64; 4]> {
         if let Holder::Real(device) = &self.holder { device.orientation() } else { None }

@@ -1,14 +1,15 @@
 //! One tick of the loop: sample, compute, hand over. Bounded work, no allocation, nothing that waits.
 
+use crate::needle::{self, NeedleStage};
 use crate::{HapticError, breath::Breather, device, operator::Operator, outbox::Outbox, setup};
 use maille_breathing::Patient;
-use maille_contact::{HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
+use maille_contact::{DevicePose, HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
 use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Scene};
 use maille_store::Reader;
-use maille_transport::Life;
+use maille_transport::{Domain, Life};
 use maille_volume::Sampler;
 use std::{sync::Arc, sync::atomic::Ordering::Relaxed, thread::Thread};
 
@@ -17,6 +18,8 @@ pub(crate) struct Loop<'a> {
     reader: &'a Reader,
     core: HapticCore,
     operator: Operator,
+    /// in a scene with a needle: it takes the place of contact
+    needle: Option<NeedleStage>,
     /// in a scene that breathes
     breather: Option<Breather<'a>>,
     threshold_hu: f64,
@@ -38,6 +41,7 @@ pub(crate) struct Loop<'a> {
 impl<'a> Loop<'a> {
     /// Sets the loop up; everything that allocates happens here.
     pub fn new(
+        domain: &Domain,
         scene: &Scene,
         reader: &'a Reader,
         patient: Option<Patient<'a>>,
@@ -61,8 +65,10 @@ impl<'a> Loop<'a> {
             scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
         let way = way.ok_or(HapticError::NoTool)?;
         let real = real.map(|(kind, options)| device::open(kind, options, scene, &way)).transpose()?;
+        let needle = NeedleStage::new(domain, scene, &reader.info().grid, config.limits)?;
         Ok(Self {
             reader,
+            needle,
             core: HapticCore::new(config),
             operator: Operator::new(tool, way, real),
             breather: patient.map(Breather::new),
@@ -84,6 +90,9 @@ impl<'a> Loop<'a> {
     /// Goes on from where a haptic process that died left the tip, so that tissue which the tip is still in is felt from the wall it came
     /// through and not taken for something to be freed from first. The force rises from zero all the same.
     pub fn resume(&mut self, control: &ControlBlock) {
+        if let Some(needle) = &mut self.needle {
+            return needle.resume(control);
+        }
         if let Some((last, _)) = control.tool.load::<ToolState>().filter(|(last, _)| last.flags & TOOL_IN_CONTACT != 0) {
             let (tip_mm, proxy_mm) = self.breather.as_ref().map_or((last.tip_mm, last.proxy_mm), |breather| breather.resume(&last));
             self.core.resume(tip_mm, proxy_mm);
@@ -97,6 +106,9 @@ impl<'a> Loop<'a> {
         self.listen(control);
         let said = || control.device.load().map(|(said, _)| said);
         let (mut pose, pose_age_s) = self.operator.sample(now_ns, monotonic_ns, self.command.as_ref(), said);
+        if self.needle.is_some() {
+            return self.run_needle(life, monotonic_ns, now_ns, (pose, pose_age_s), release);
+        }
         let (mut orientation, world, vouched) = (self.operator.orientation(), pose.direction, pose.valid);
         // from here to `leave` everything is of the patient at rest
         let mut moment = self.breather.as_mut().map(|breather| breather.enter(now_ns, &mut pose, &mut orientation));
@@ -125,6 +137,44 @@ impl<'a> Loop<'a> {
             control.device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence: self.ticks, incarnation, force_n: out.force_n });
         }
         self.hand_over(control, now_ns, epoch, [world, pose.direction], tip_reference_mm, &out);
+        self.last = Some(out);
+        out.force_n
+    }
+
+    /// The same with a needle: it goes through tissue where a tool would press.
+    fn run_needle(
+        &mut self,
+        life: &Life,
+        monotonic_ns: u64,
+        now_ns: u64,
+        (pose, pose_age_s): (DevicePose, f64),
+        release: bool,
+    ) -> [f64; 3] {
+        let control = life.control();
+        let (orientation, held) = (self.operator.orientation(), !self.operator.is_let_go());
+        let Some(stage) = &mut self.needle else { return [0.0; 3] };
+        let snapshot = self.reader.snapshot();
+        let mut moment = needle::Moment { now_ns, pose, pose_age_s, orientation, held, release, phase: -1.0 };
+        let out = match &self.breather {
+            Some(breather) => {
+                let (field, phase) = breather.field(now_ns);
+                moment.phase = phase;
+                let out = stage.tick(&snapshot, &field, &moment);
+                (self.residual_mm, self.unmapped) = (field.residual_mm.get(), held && pose.valid && field.residual_mm.get().is_none());
+                out
+            }
+            None => stage.tick(&snapshot, &maille_needle::AtRest, &moment),
+        };
+        stage.publish(control);
+        let (tip_reference_mm, direction) = (stage.tip_reference_mm(), stage.direction());
+        let epoch = snapshot.epoch();
+        self.operator.write(out.force_n, out.torque_n_mm);
+        self.ticks += 1;
+        if self.operator.is_external() {
+            let incarnation = life.incarnation();
+            control.device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence: self.ticks, incarnation, force_n: out.force_n });
+        }
+        self.hand_over(control, now_ns, epoch, [direction, direction], tip_reference_mm, &out);
         self.last = Some(out);
         out.force_n
     }
@@ -171,7 +221,7 @@ impl<'a> Loop<'a> {
             direction,
             force_n: out.force_n,
             penetration_mm: out.penetration_mm,
-            radius_mm: self.core.config().radius_mm,
+            radius_mm: self.needle.as_ref().map_or(self.core.config().radius_mm, NeedleStage::radius_mm),
             flags: flag(out.in_contact, TOOL_IN_CONTACT)
                 | flag(self.operator.is_taken(), TOOL_TAKEN_OVER)
                 | flag(out.fading, TOOL_FADING)

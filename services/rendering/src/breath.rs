@@ -72,6 +72,11 @@ impl<'a> Breather<'a> {
         self.warp.update_field(&self.info, model.grid(), &self.collapsed.displacement(), longest_mm, contraction)
     }
 
+    /// Where a point of the patient at rest is at a simulation time [mm].
+    pub fn to_world(&self, time_ns: u64, reference: [f64; 3]) -> [f64; 3] {
+        self.patient.at(time_ns).to_world(reference)
+    }
+
     /// What the last frame's warp is worth: how far from its place anything is drawn [mm], and nodes without a rest position.
     pub fn report(&self) -> (f64, u64) {
         (drawn_off_mm(&self.report, self.view_mm).into(), self.report.unsettled as u64)
@@ -109,7 +114,7 @@ mod tests {
         let lifted = |p: [f64; 3]| Some([p[0], p[1], p[2] + eye_mm]);
         (scene.rendering.eye, scene.rendering.target) = (lifted(view.eye), lifted(view.target));
         let mut composer = Composer::new(&scene);
-        composer.draw(&reader.snapshot(), warp, &View::new(&scene, &box_mm).unwrap(), None, false).unwrap();
+        composer.draw(&reader.snapshot(), warp, &View::new(&scene, &box_mm).unwrap(), None, false, None).unwrap();
         let mut pixels = vec![0; composer.bytes()];
         composer.write(&mut pixels, FrameHeader::default());
         pixels

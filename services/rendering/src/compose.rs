@@ -3,7 +3,8 @@
 use crate::{overlay, view::View};
 use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
 use maille_raycast::{
-    Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Ultrasound, Warp, render_extra, section_with, ultrasound,
+    Capsule, Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Ultrasound, Warp, render_extra, section_with,
+    ultrasound,
 };
 use maille_scene::Scene;
 use maille_volume::BrickSource;
@@ -40,6 +41,7 @@ impl Composer {
         view: &View,
         tool: Option<&ToolState>,
         held: bool,
+        needle: Option<&[Capsule]>,
     ) -> Result<(), RenderError> {
         let (camera, at_tip) = view.camera(tool);
         let settings = view.settings(at_tip);
@@ -52,7 +54,8 @@ impl Composer {
         };
         let [whole, sections @ .., fan] = &mut self.pictures;
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
-        let bodies = Geometry { capsules: tool_body.as_slice(), meshes: &[] };
+        let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
+        let bodies = Geometry { capsules, meshes: &[] };
         // an endoscope does not see itself
         let extras = Extras { warp, geometry: Some(&bodies).filter(|_| !at_tip), ..Extras::default() };
         render_extra(&extras, source, skip, &camera, &settings, whole)?;

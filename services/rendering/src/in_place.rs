@@ -120,7 +120,7 @@ impl World {
     }
 
     fn draw(&self, composer: &mut Composer, source: &impl BrickSource) -> Vec<u8> {
-        composer.draw(source, None, &self.view(), None, false).unwrap();
+        composer.draw(source, None, &self.view(), None, false, None).unwrap();
         let mut pixels = vec![0; composer.bytes()];
         composer.write(&mut pixels, maille_contract::FrameHeader::default());
         pixels

@@ -11,9 +11,11 @@ mod breath;
 mod compose;
 #[cfg(test)]
 mod in_place;
+mod needle;
 mod overlay;
 mod view;
 
+use maille_contract::needle::NeedleState;
 use maille_contract::{FrameHeader, Role, ToolState, control::Counter};
 use maille_scene::{BoxMm, Machine, Scene};
 use maille_store::Reader;
@@ -70,6 +72,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
     let mut shown = None;
+    let has_needle = scene.has_effect("needle");
+    let mut bodies = Vec::new();
     loop {
         let now = monotonic_ns();
         if !life.beat(now) {
@@ -91,15 +95,21 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         // a patient who breathes is another one in every frame
         let time_ns = life.control().time_ns(now);
         let moment = breather.as_ref().map_or(0, |_| time_ns);
-        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), held, moment);
+        let needle = if has_needle { life.control().needle.load::<NeedleState>().map(|(needle, _)| needle) } else { None };
+        let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
+        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
         if shown == Some(seen) && now - last_sent_ns < STILL_NS {
             continue;
         }
         shown = Some(seen);
         let snapshot = reader.snapshot();
+        if let Some(needle) = &needle {
+            let to_world = |at| breather.as_ref().map_or(at, |breather| breather.to_world(time_ns, at));
+            needle::bodies(needle, to_world, &mut bodies);
+        }
         let drawn = pool.install(|| {
             let warp = breather.as_mut().map(|breather| breather.go(time_ns));
-            composer.draw(&snapshot, warp, &view, tool.as_ref(), held)
+            composer.draw(&snapshot, warp, &view, tool.as_ref(), held, needle.map(|_| bodies.as_slice()))
         });
         let render_ns = monotonic_ns() - now;
         let epoch = snapshot.epoch();

@@ -22,6 +22,7 @@ pub mod doctor;
 pub mod enter;
 mod error;
 pub mod memory;
+pub mod needle;
 mod output;
 mod patient;
 mod process;

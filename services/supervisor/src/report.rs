@@ -28,9 +28,10 @@
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
+//! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (last) and `closest_to_target_mm` in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` of a tick's rod, `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
-use crate::{memory::MIB, watch::Post};
+use crate::{memory::MIB, needle::NeedleReport, watch::Post};
 use maille_contract::{
     ControlBlock, Role,
     control::Counter,
@@ -184,6 +185,8 @@ pub struct RunReport {
     pub ended_by: String,
     pub services: BTreeMap<String, ServiceReport>,
     pub store: StoreReport,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub needle: Option<NeedleReport>,
 }
 
 impl ServiceReport {
@@ -319,6 +322,29 @@ impl fmt::Display for RunReport {
             for ((bound, tick), (_, late)) in h.tick_histogram.iter().zip(&h.lateness_histogram).filter(|(a, b)| a.1 + b.1 > 0) {
                 let bound = bound.map_or("more".into(), |us| format!("{us} µs"));
                 writeln!(f, "{bound:>24} {tick:>9} {late:>9}")?;
+            }
+        }
+        if let Some(n) = &self.needle {
+            let mm = |d: Option<f64>| d.map_or("-".into(), |d| format!("{d:.1} mm"));
+            let forbidden = if n.forbidden_touched.is_empty() { "none".into() } else { n.forbidden_touched.join(", ") };
+            writeln!(
+                f,
+                "\nneedle: {:.1} s inside, {:.1} mm deep, tip to target {} (closest {}), forbidden touched: {forbidden}; at most {:.2} N, {:.0} N·mm",
+                n.inside_s,
+                n.deepest_mm,
+                mm(n.tip_to_target_mm),
+                mm(n.closest_to_target_mm),
+                n.peak_force_n,
+                n.peak_torque_n_mm
+            )?;
+            for e in &n.events {
+                let phase = e.breath_phase.map_or(String::new(), |p| format!(", breath at {p:.2}"));
+                let forbidden = if e.forbidden { " (forbidden)" } else { "" };
+                writeln!(
+                    f,
+                    "  {:>7.2} s  {:>6.1} mm  {} {}{forbidden} by {:.2} N{phase}",
+                    e.time_s, e.depth_mm, e.what, e.tissue, e.force_n
+                )?;
             }
         }
         let low = self.store.spare_slots_low.map_or("all".into(), |low| low.to_string());

@@ -6,6 +6,7 @@
 
 use crate::{
     SupervisorError, memory,
+    needle::{self, NeedleReport},
     patient::{Patient, Progress},
     report::{RunReport, ServiceReport, StoreReport},
     watch::{Post, Watch, end_all},
@@ -44,6 +45,7 @@ pub struct Simulation {
     /// who does what
     pub posts: Vec<Post>,
     info: VolumeInfo,
+    scene: Scene,
     spare_slots: usize,
     started_ns: u64,
     killed: Vec<Role>,
@@ -76,7 +78,9 @@ impl Simulation {
         let segments = StorePlan { info: volume.info.clone(), sizes }.segments();
         let frames = frame_pool_bytes(plan.frame_bytes);
         let regions: u64 = breath.map_or(0, |breath| breath.segments().iter().map(|(_, _, bytes)| bytes).sum());
-        memory::check_space(segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions)?;
+        memory::check_space(
+            segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions + needle::labels_bytes(&scene),
+        )?;
 
         let domain = Files(Domain::fresh()?);
         let control = ControlMap::create(&domain.0)?;
@@ -92,6 +96,7 @@ impl Simulation {
         if let Some(breath) = breath {
             breath.publish(&mut store, &domain.0)?;
         }
+        needle::publish_labels(&scene, &mut store, &domain.0)?;
         let path = domain.0.directory().join(SCENE_FILE);
         fs::write(&path, scene.to_toml()).map_err(SupervisorError::io(format!("{} cannot be written", path.display())))?;
         control.view.store(&first_view(&scene, volume));
@@ -112,6 +117,7 @@ impl Simulation {
             domain,
             posts,
             info: volume.info.clone(),
+            scene,
             spare_slots: sizes.spare_slots,
             started_ns: monotonic_ns(),
             killed: Vec::new(),
@@ -163,6 +169,7 @@ impl Simulation {
             duration_s,
             ended_by: ended_by.to_owned(),
             services,
+            needle: NeedleReport::of(&self.scene, &self.control),
             store: StoreReport::of(
                 self.info.grid.voxel_count(),
                 &segments,

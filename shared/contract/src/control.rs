@@ -10,6 +10,7 @@ use crate::{
     histogram::SharedHistogram,
     messages::{DeviceForce, DeviceState, ToolCommand, ToolState, ViewState},
     names::PINS_PER_ROLE,
+    needle::{NeedleLog, NeedleState},
 };
 use bytemuck::Zeroable;
 use core::sync::atomic::{
@@ -18,7 +19,7 @@ use core::sync::atomic::{
 };
 
 /// "maille" and the version of this layout.
-pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille03");
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille04");
 /// Pins in the block.
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
@@ -211,6 +212,10 @@ pub struct ControlBlock {
     pub inversion: SharedHistogram,
     /// how far from its place anything in a frame may be drawn, by its warp [nm, in place of ns]. Writer: rendering
     pub warp: SharedHistogram,
+    /// the needle of the last tick, in a scene with one. Writer: haptic
+    pub needle: LatestCell<{ words::<NeedleState>() }>,
+    /// what the needle did in this run. Writer: haptic
+    pub needle_log: LatestCell<{ words::<NeedleLog>() }>,
     /// one for each [`Role`](crate::Role)
     pub services: [ServiceCell; 4],
     /// pins of the store's readers; see [`Role::pins`](crate::Role::pins)

@@ -18,6 +18,7 @@ pub mod histogram;
 pub mod index;
 pub mod messages;
 pub mod names;
+pub mod needle;
 pub mod probe;
 pub mod segment_header;
 

@@ -8,6 +8,7 @@ use maille_contract::{
     ViewState,
     index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
+    needle::{LabelsHeader, NeedleEvent, NeedleLog, NeedleState},
     probe::{Ping, Pong},
     segment_header::{BODY_OFFSET, SEGMENT_MAGIC, SegmentHeader},
 };
@@ -54,6 +55,11 @@ fn shared_words_keep_their_sizes_and_offsets() {
     golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
     golden!(BreathLead, 88, since_ns: 0, base_ns: 8, speed: 16, mix: 40, slider: 64);
     golden!(BreathState, 216, stamp: 0, leads: 24, held: 200, led: 208);
+    golden!(LabelsHeader, 24, size: 0);
+    golden!(NeedleState, 1_648, time_ns: 0, nodes: 8, path_nodes: 16, tissue: 24, radius_mm: 32, depth_mm: 40, ahead_mm: 48, parts_n: 56, torque_n_mm: 80, residual_mm: 104,
+        nodes_mm: 112, path_mm: 880);
+    golden!(NeedleEvent, 72, time_ns: 0, kind: 8, tissue: 16, reference_mm: 24, depth_mm: 48, force_n: 56, phase: 64);
+    golden!(NeedleLog, 4_304, count: 0, ticks_inside: 8, inside_ns: 16, peaks: 24, residual_mm: 40, to_target_mm: 48, deepest_mm: 64, path_nodes: 72, path_mm: 80, events: 848);
     golden!(MotionHeader, 16, bytes: 0, storage_error_mm: 8);
     assert_eq!((offset_of!(ControlBlock, magic), align_of::<ControlBlock>()), (0, 64));
     assert_eq!(offset_of!(ControlBlock, size_bytes), 8);

@@ -312,6 +312,17 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some("set `cutting = true` under [effects], or hold another tool".into());
         faults.push(document.fault("tool.kind", "a blade is good for nothing without the effect `cutting`", "needs an effect", help));
     }
+    let needle = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Needle);
+    if needle != scene.has_effect("needle") {
+        let help = Some("a needle takes `tool.kind = \"needle\"` and `needle = true` under [effects], both".into());
+        let (path, what) = if needle {
+            ("tool.kind", "a needle needs the effect `needle`")
+        } else {
+            ("effects.needle", "the effect `needle` needs a needle to be held")
+        };
+        faults.push(document.fault(path, what, "one of two is missing", help));
+    }
+    check_needle(document, scene, faults);
     if scene.deformation.sampling_order == 2 {
         let help = Some("use 1 (trilinear) or 3 (tricubic)".into());
         faults.push(document.fault("deformation.sampling_order", "there is no interpolation of order 2", "1 or 3", help));
@@ -402,6 +413,38 @@ fn check_path(document: &Document, key: &str, path: &[PathPoint], faults: &mut V
             (0..3).for_each(|c| check_range(document, &format!("{key}.{n}.fraction.{c}"), f[c], [-0.5, 1.5], "of the box", faults));
         }
         check_direction(document, &at("direction"), point.direction, faults);
+    }
+}
+
+fn check_needle(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
+    check_finite(document, "needle.target_mm", scene.needle.target_mm, faults);
+    for (n, row) in scene.needle.tissue.iter().enumerate() {
+        let at = |field: &str| format!("needle.tissue.{n}.{field}");
+        if row.hu.is_some_and(|[low, high]| !(low.is_finite() && high.is_finite() && low < high)) {
+            faults.push(document.fault(&at("hu"), format!("tissue `{}` has no range", row.name), "low must be below high", None));
+        }
+        if row.labels.contains(&0) {
+            let help = Some("0 is no tissue: what no row fits is as nothing".into());
+            faults.push(document.fault(&at("labels"), "label 0 is air", "no tissue", help));
+        }
+        for (field, value, range, unit) in [
+            ("stiffness_n_per_mm", Some(row.stiffness_n_per_mm), [1e-3, 1e3], "N/mm"),
+            ("a1_n_per_mm", Some(row.a1_n_per_mm), [1e-3, 1e3], "N/mm"),
+            ("a2_n_per_mm2", Some(row.a2_n_per_mm2), [0.0, 1e3], "N/mm²"),
+            ("cutting_force_n", row.cutting_force_n, [1e-3, 1e3], "N"),
+            ("friction_n", Some(row.friction_n), [0.0, 1e3], "N"),
+            ("capsule_n", row.capsule_n, [1e-3, 1e3], "N"),
+            ("capsule_mm", Some(row.capsule_mm), [0.0, 100.0], "mm"),
+            ("relaxing", Some(row.relaxing), [0.0, 0.95], ""),
+            ("relaxation_s", Some(row.relaxation_s), [1e-3, 1e3], "s"),
+        ] {
+            if let Some(value) = value {
+                check_range(document, &at(field), value, range, unit, faults);
+            }
+        }
+    }
+    if !(1..=30).contains(&scene.needle.tissue.len()) {
+        faults.push(document.fault("needle.tissue", "a needle meets 1 to 30 tissues", "none, or too many", None));
     }
 }
 

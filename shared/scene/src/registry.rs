@@ -269,7 +269,22 @@ pub static EFFECTS: &[Effect] = &[
         hard_cases: &["a trace with holes", "folded tissue", "beyond the model's grid", "breath held and slid", "restart in mid-breath"],
         ..Effect::named("breathing", "the patient breathes: seen, felt, and led from the page")
     },
-    Effect::later("needle", "a bending needle with puncture forces", &["contact"]),
+    Effect {
+        processes: &[Process::Haptic],
+        stages: &[stage(Process::Haptic, "needle", Per::Tick)],
+        depends_on: &["contact"],
+        hard_cases: &[
+            "three to two hundred nodes",
+            "stiffness over six decades",
+            "ticks of ten to a hundred milliseconds",
+            "a teleport",
+            "retraction in one tick",
+            "grazing entry",
+            "stiff friction",
+            "poses that are no numbers",
+        ],
+        ..Effect::named("needle", "a needle (`tool.kind = \"needle\"`) that bends, cuts into tissue and is held there")
+    },
     Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
     Effect::later("x-ray", "a fluoroscopic view", &[]),
     Effect {
@@ -437,6 +452,28 @@ pub static KNOBS: &[Knob] = &[
         cost: "no time: distance to the bound beyond which the device is not passive",
         get: |s| s.haptic.contact_stiffness_n_per_mm,
         set: |s, v| s.haptic.contact_stiffness_n_per_mm = v,
+    },
+    Knob {
+        name: "needle.nodes",
+        effect: "needle",
+        summary: "nodes of the rod",
+        defaults: [15.0, 25.0, 50.0],
+        error: "place of the tip under load, of the deflection [1]",
+        truth: "the elastica",
+        cost: "tick time, 0.3 µs a node",
+        get: |s| s.needle.nodes as f64,
+        set: |s, v| s.needle.nodes = v as usize,
+    },
+    Knob {
+        name: "needle.path_spacing_mm",
+        effect: "needle",
+        summary: "distance of nodes of the path that the tip has cut",
+        defaults: [10.0, 5.0, 2.5],
+        error: "place of the path between its nodes [mm]",
+        truth: "the same insertion with nodes every 0.5 mm",
+        cost: "tick time, about 0.2 µs a node",
+        get: |s| s.needle.path_spacing_mm,
+        set: |s, v| s.needle.path_spacing_mm = v,
     },
 ];
 

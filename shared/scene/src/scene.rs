@@ -2,6 +2,7 @@
 
 use crate::{
     breathing::Breathing,
+    needle::Needle,
     sections::{Console, Deformation, Haptic, Memory, Rendering},
     tissue::{self, Tissue},
     tool::{DeviceSection, Tool},
@@ -158,6 +159,9 @@ pub struct Scene {
     /// the patient who breathes, for the effect of that name
     #[serde(skip_serializing_if = "is_default")]
     pub breathing: Breathing,
+    /// the needle, for the effect of that name
+    #[serde(skip_serializing_if = "is_default")]
+    pub needle: Needle,
     /// ChainMail and the mapper
     pub deformation: Deformation,
     /// loop, contact, limits of the device
@@ -185,6 +189,7 @@ impl Default for Scene {
             tool: None,
             device: DeviceSection::default(),
             breathing: Breathing::default(),
+            needle: Needle::default(),
             deformation: Deformation::default(),
             haptic: Haptic::default(),
             rendering: Rendering::default(),

@@ -18,6 +18,8 @@ pub enum ToolKind {
     Probe,
     /// a blade, for the effect `cutting`: a straight edge from the tip along the shaft; it cuts where it goes and pushes nothing
     Blade,
+    /// a needle, for the effect `needle`: it bends, cuts into tissue along its axis and is held there; see `[needle]`
+    Needle,
 }
 
 /// What of the tool touches tissue.

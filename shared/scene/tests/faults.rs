@@ -85,8 +85,10 @@ fn all_faults_of_a_scene_are_told_at_once() {
 fn effects_are_known_available_and_not_alone() {
     let error = fault("[effects]\nsection = true");
     assert_eq!(error.to_string(), "scene.toml:2: unknown effect `section`, did you mean `sections`?");
-    let error = fault("[effects]\nneedle = true");
+    let error = fault("[effects]\nx-ray = true");
     assert!(error.to_string().contains("declared for later and not built yet"), "{error}");
+    let error = fault("[effects]\nneedle = true");
+    assert!(error.to_string().contains("needs a needle to be held"), "{error}");
     let error = fault("[effects]\ndeformation = true");
     assert!(error.to_string().contains("needs `contact`"), "{error}");
     assert_eq!(error.advice(), Some("add a [tool] table, or set `deformation = false`"));

@@ -69,6 +69,13 @@ impl<'m> MotionAt<'m> {
         (self.model.mm_from_index * Vector3::new(f64::from(x), f64::from(y), f64::from(z))).into()
     }
 
+    /// ∂u/∂X at a reference position [mm, LPS], patient frame; none across the borders of the grid.
+    pub fn gradient(&self, reference: [f64; 3]) -> Matrix3<f64> {
+        let (_, slopes) = self.jet(self.index(reference));
+        let slopes = slopes.map(f32x4::to_array);
+        self.model.mm_from_index * Matrix3::from_fn(|r, c| f64::from(slopes[c][r])) * self.model.index_from_mm
+    }
+
     /// Where a reference position is now: x = X + u(X) [mm].
     pub fn to_world(&self, reference: [f64; 3]) -> [f64; 3] {
         let u = self.displacement_mm(reference);

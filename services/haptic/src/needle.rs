@@ -1,0 +1,321 @@
+//! The needle in the loop: the scene's needle on the device, tissue from the snapshot or its labels, the force within the device's limits.
+//!
+//! Numerics are `maille-needle`'s; here is what it knows nothing of: which tissue is where, which limits the device has, what is told to others. It
+//! takes the place of contact by proxies in scenes that have it. Tissue: the label at the nearest voxel where the patient has labels, else the
+//! CT value, trilinear; the first row of the scene's table that fits. Labels are those of rest: tissue that was pushed aside takes only its CT
+//! values with it.
+//!
+//! Frame: world; inside the patient the reference space of `maille-needle`. Degraded modes: a pose that is stale or invalid → the last one stands
+//! and the force fades; a run that ends → the force fades. Cost: the needle's tick, and a look-up of tissue or two. Allocation: none after `new`.
+
+use crate::HapticError;
+use maille_contact::{DevicePose, ForceShaper, Limits, TickOutputs};
+use maille_contract::ControlBlock;
+use maille_contract::needle::{
+    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleEvent,
+    NeedleLog, NeedleState,
+};
+use maille_needle::{
+    AIR, Breathing, Capsule, EventKind, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q,
+    RodParameters, Tissue, V3,
+};
+use maille_scene::{Needle, NeedleTissue, Scene};
+use maille_store::Region;
+use maille_transport::Domain;
+use maille_volume::{BrickSource, Grid, Sampler};
+
+/// Torque of a device that can give one [N·mm].
+const MAX_TORQUE_N_MM: f64 = 150.0;
+/// Ticks between two words to the log.
+const LOG_EVERY: u64 = 100;
+/// A pose older than this fades the force [s].
+const MAX_POSE_AGE_S: f64 = 0.02;
+
+/// Which tissue is where.
+struct Rows {
+    by_label: [u8; 256],
+    by_value: Vec<([f64; 2], u8)>,
+    labels: Option<Region<LabelsHeader>>,
+    grid: Grid,
+}
+
+/// Tissue of one snapshot.
+struct Seen<'a, S: BrickSource> {
+    rows: &'a Rows,
+    /// label of each voxel; empty where there are none
+    labels: &'a [u8],
+    sampler: Sampler<'a, S>,
+}
+
+impl<S: BrickSource> Tissue for Seen<'_, S> {
+    fn material_at(&self, reference: [f64; 3]) -> u8 {
+        let index = self.sampler.index(reference);
+        let size = self.rows.grid.size;
+        // false for what is no number
+        if !(0..3).all(|c| index[c] >= 0.0 && index[c] <= (size[c] - 1) as f64) {
+            return AIR;
+        }
+        if self.labels.is_empty() {
+            let value = self.sampler.value(reference).unwrap_or(f64::NEG_INFINITY);
+            return self.rows.by_value.iter().find(|([low, high], _)| value >= *low && value < *high).map_or(AIR, |(_, row)| *row);
+        }
+        let [i, j, k] = index.map(|v| (v + 0.5) as usize);
+        self.labels.get((k * size[1] + j) * size[0] + i).map_or(AIR, |&label| self.rows.by_label[usize::from(label)])
+    }
+}
+
+/// What goes into a tick beside the tissue.
+pub(crate) struct Moment {
+    pub now_ns: u64,
+    pub pose: DevicePose,
+    pub pose_age_s: f64,
+    pub orientation: Option<[f64; 4]>,
+    /// a hand holds the needle
+    pub held: bool,
+    /// the force shall go
+    pub release: bool,
+    /// phase of the breath, −1 where nobody breathes
+    pub phase: f64,
+}
+
+/// The needle's part of the loop.
+pub(crate) struct NeedleStage {
+    tool: NeedleTool,
+    rows: Rows,
+    radius_mm: f64,
+    target: Option<V3>,
+    force: ForceShaper,
+    torque: ForceShaper,
+    orientation: Q,
+    last_ns: Option<u64>,
+    state: NeedleState,
+    log: NeedleLog,
+    ticks: u64,
+    path_reference: Vec<V3>,
+}
+
+impl NeedleStage {
+    /// The scene's needle; `None` when the scene has none. Everything that allocates happens here.
+    pub fn new(domain: &Domain, scene: &Scene, grid: &Grid, limits: Limits) -> Result<Option<Self>, HapticError> {
+        if !scene.has_effect("needle") {
+            return Ok(None);
+        }
+        let n = &scene.needle;
+        let fail = |e: maille_needle::NeedleError| HapticError::Scene(format!("[needle] {e}"));
+        let (config, gauge) = config(n, &limits).map_err(fail)?;
+        let materials: Vec<Material> = n.tissue.iter().map(material).collect();
+        let tool = NeedleTool::new(config, MaterialTable::new(&materials).map_err(fail)?).map_err(fail)?;
+        let labels = scene.volume.file.is_none().then(|| Region::open(domain, LABELS_REGION, LABELS_KIND)).transpose()?;
+        let mut rows = Rows { by_label: [AIR; 256], by_value: Vec::new(), labels, grid: grid.clone() };
+        for (row, tissue) in n.tissue.iter().enumerate().rev() {
+            tissue.labels.iter().for_each(|&l| rows.by_label[usize::from(l)] = row as u8 + 1);
+        }
+        rows.by_value = n.tissue.iter().enumerate().filter_map(|(row, t)| Some((t.hu?, row as u8 + 1))).collect();
+        let room = tool.path().nodes().len().max(512);
+        let torque = Limits { max_force_n: MAX_TORQUE_N_MM, max_slew_n_per_s: 50.0 * MAX_TORQUE_N_MM, ..limits };
+        let mut log: NeedleLog = bytemuck::Zeroable::zeroed();
+        log.to_target_mm = [f64::NAN; 2];
+        Ok(Some(Self {
+            tool,
+            rows,
+            radius_mm: 0.5 * gauge.outer_mm,
+            target: n.target_mm.map(V3::from),
+            force: ForceShaper::new(limits),
+            torque: ForceShaper::new(torque),
+            orientation: Q::identity(),
+            last_ns: None,
+            state: bytemuck::Zeroable::zeroed(),
+            log,
+            ticks: 0,
+            path_reference: Vec::with_capacity(room),
+        }))
+    }
+
+    /// Goes on with the log of a process that died; its needle is out and has to go in again.
+    pub fn resume(&mut self, control: &ControlBlock) {
+        if let Some((log, _)) = control.needle_log.load::<NeedleLog>() {
+            self.log = log;
+        }
+    }
+
+    /// One tick.
+    pub fn tick<S: BrickSource, B: Breathing>(&mut self, snapshot: &S, breathing: &B, moment: &Moment) -> TickOutputs {
+        let dt = self.last_ns.replace(moment.now_ns).map_or(1e-3, |last| moment.now_ns.saturating_sub(last) as f64 * 1e-9);
+        let handle = self.handle(moment);
+        let labels: &[u8] = self.rows.labels.as_ref().map_or(&[], |region| region.body::<u8>());
+        let tissue = Seen { rows: &self.rows, labels, sampler: Sampler::new(snapshot) };
+        let out = self.tool.tick(&Inputs { dt_s: dt, handle, held: moment.held, breathing, tissue: &tissue });
+        let fading = moment.release || !moment.pose.valid || moment.pose_age_s.is_nan() || moment.pose_age_s > MAX_POSE_AGE_S;
+        // a late tick gets no larger a step
+        let step = dt.min(2e-3);
+        let force_n = self.force.shape(out.force_n, step, fading);
+        let torque_n_mm = self.torque.shape(out.torque_n_mm, step, fading);
+        self.ticks += 1;
+        self.note(moment, dt, &out, force_n, torque_n_mm);
+        self.draw(moment.now_ns, &out, torque_n_mm);
+        TickOutputs {
+            force_n,
+            torque_n_mm,
+            tip_mm: out.tip_mm,
+            proxy_mm: out.tip_mm,
+            contact_mm: out.tip_mm,
+            normal: [0.0; 3],
+            penetration_mm: out.depth_mm,
+            indentation_mm: out.ahead_mm,
+            in_contact: out.path_nodes > 0,
+            nodes: u32::from(out.path_nodes > 0),
+            buried: false,
+            fading,
+            tool_move: None,
+            faults: Default::default(),
+        }
+    }
+
+    /// The needle's place, for others.
+    pub fn tip_reference_mm(&self) -> [f64; 3] {
+        self.tool.path().tip().map_or(self.tool.nodes()[self.tool.nodes().len() - 1], |tip| tip.reference).into()
+    }
+
+    /// Where the needle points at its tip, world.
+    pub fn direction(&self) -> [f64; 3] {
+        self.tool.rod().tip_tangent().into()
+    }
+
+    /// Radius [mm].
+    pub fn radius_mm(&self) -> f64 {
+        self.radius_mm
+    }
+
+    /// Tells the shape, and now and then the log.
+    pub fn publish(&mut self, control: &ControlBlock) {
+        control.needle.store(&self.state);
+        if self.ticks.is_multiple_of(LOG_EVERY) || self.log.events_changed(control) {
+            control.needle_log.store(&self.log);
+        }
+    }
+
+    /// The device's pose says where the tip of a straight needle is: the handle lies behind it. A device that knows no roll is turned no more
+    /// than it must be.
+    fn handle(&mut self, moment: &Moment) -> HandlePose {
+        let direction = V3::from(moment.pose.direction);
+        let told = moment.orientation.filter(|q| q.iter().all(|v| v.is_finite())).and_then(|[x, y, z, w]| {
+            let q = nalgebra::Quaternion::new(w, x, y, z);
+            (q.norm() > 1e-9).then(|| Q::from_quaternion(q))
+        });
+        if let Some(q) = told {
+            self.orientation = q;
+        } else if direction.iter().all(|v| v.is_finite())
+            && let Some(direction) = direction.try_normalize(1e-9)
+        {
+            let z = self.orientation * V3::z();
+            let turn = Q::rotation_between(&z, &direction)
+                .unwrap_or_else(|| Q::from_axis_angle(&(self.orientation * V3::x_axis()), std::f64::consts::PI));
+            self.orientation = turn * self.orientation;
+            self.orientation.renormalize_fast();
+        }
+        let position = V3::from(moment.pose.position_mm) - self.orientation * V3::z() * self.tool.config().rod.length_mm;
+        let invalid = [f64::NAN; 3];
+        let position_mm = if moment.pose.valid { position.into() } else { invalid };
+        HandlePose { position_mm, orientation_xyzw: self.orientation.coords.into() }
+    }
+
+    fn note(&mut self, moment: &Moment, dt: f64, out: &Outputs, force_n: [f64; 3], torque_n_mm: [f64; 3]) {
+        let log = &mut self.log;
+        let size = |v: [f64; 3]| V3::from(v).norm();
+        log.peaks = [log.peaks[0].max(size(force_n)), log.peaks[1].max(size(torque_n_mm))];
+        if out.path_nodes > 0 {
+            log.ticks_inside += 1;
+            log.inside_ns += (dt * 1e9) as u64;
+            log.residual_mm = log.residual_mm.max(out.solved.residual_mm);
+        }
+        if let (Some(target), true) = (self.target, out.path_nodes > 1) {
+            let now = (V3::from(out.tip_reference_mm) - target).norm();
+            log.to_target_mm = [now, log.to_target_mm[1].min(now)];
+        }
+        if out.depth_mm > log.deepest_mm && (out.depth_mm > log.deepest_mm + 0.5 || self.ticks.is_multiple_of(LOG_EVERY)) {
+            log.deepest_mm = out.depth_mm;
+            log.path_nodes = fill(&mut log.path_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
+        }
+        for event in out.events.iter().flatten() {
+            if let Some(slot) = log.events.get_mut(log.count as usize).filter(|_| (log.count as usize) < NEEDLE_EVENTS) {
+                *slot = NeedleEvent {
+                    time_ns: moment.now_ns,
+                    kind: match event.kind {
+                        EventKind::Contact => NEEDLE_MET,
+                        EventKind::Puncture => NEEDLE_PUNCTURED,
+                        EventKind::Withdrawn => NEEDLE_WITHDRAWN,
+                    },
+                    tissue: event.material.into(),
+                    reference_mm: event.reference_mm,
+                    depth_mm: event.depth_mm,
+                    force_n: event.force_n,
+                    phase: moment.phase,
+                };
+            }
+            log.count += 1;
+        }
+    }
+
+    fn draw(&mut self, now_ns: u64, out: &Outputs, torque_n_mm: [f64; 3]) {
+        let s = &mut self.state;
+        (s.time_ns, s.tissue, s.radius_mm) = (now_ns, out.material.into(), self.radius_mm);
+        (s.depth_mm, s.ahead_mm, s.residual_mm, s.torque_n_mm) = (out.depth_mm, out.ahead_mm, out.solved.residual_mm, torque_n_mm);
+        s.parts_n = [out.cutting_n, out.friction_n, out.base_n];
+        s.nodes = fill(&mut s.nodes_mm, self.tool.nodes().iter().copied(), &mut self.path_reference) as u64;
+        s.path_nodes = fill(&mut s.path_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
+    }
+}
+
+/// Whether the log has events that were not told.
+trait EventsChanged {
+    fn events_changed(&self, control: &ControlBlock) -> bool;
+}
+
+impl EventsChanged for NeedleLog {
+    fn events_changed(&self, control: &ControlBlock) -> bool {
+        self.count > 0 && control.needle_log.load::<NeedleLog>().is_none_or(|(told, _)| told.count != self.count)
+    }
+}
+
+/// Points into a fixed array: all of them, or as many as fit, evenly, ends included. `room` is memory to gather them in.
+fn fill(to: &mut [[f32; 3]; NEEDLE_NODES], points: impl Iterator<Item = V3>, room: &mut Vec<V3>) -> usize {
+    room.clear();
+    let free = room.capacity();
+    room.extend(points.take(free));
+    let count = room.len().min(NEEDLE_NODES);
+    for (n, slot) in to.iter_mut().enumerate().take(count) {
+        let at = if room.len() <= NEEDLE_NODES { n } else { n * (room.len() - 1) / (NEEDLE_NODES - 1) };
+        *slot = [room[at].x as f32, room[at].y as f32, room[at].z as f32];
+    }
+    count
+}
+
+/// The scene's table as the needle wants it.
+fn config(n: &Needle, limits: &Limits) -> Result<(NeedleConfig, Gauge), maille_needle::NeedleError> {
+    let gauge = Gauge::of(n.gauge)?;
+    let gauge = n.bending_n_mm2.map_or(gauge, |bending| gauge.with_bending(bending));
+    let rod = RodParameters { nodes: n.nodes, ..RodParameters::new(&gauge, n.length_mm) };
+    let config = NeedleConfig {
+        path_spacing_mm: n.path_spacing_mm,
+        grip_n_per_mm: n.grip_n_per_mm,
+        grip_n_mm_per_rad: n.grip_n_mm_per_rad,
+        bevel_rad: n.bevel_deg.to_radians(),
+        max_force_n: limits.max_force_n,
+        max_torque_n_mm: MAX_TORQUE_N_MM,
+        ..NeedleConfig::new(rod)
+    };
+    Ok((config, gauge))
+}
+
+fn material(t: &NeedleTissue) -> Material {
+    Material {
+        stiffness_n_per_mm: t.stiffness_n_per_mm,
+        a1_n_per_mm: t.a1_n_per_mm,
+        a2_n_per_mm2: t.a2_n_per_mm2,
+        cutting_force_n: t.cutting_force_n.unwrap_or(f64::INFINITY),
+        friction_n: t.friction_n,
+        capsule: t.capsule_n.map(|force| Capsule { cutting_force_n: force, thickness_mm: t.capsule_mm }),
+        relaxing: t.relaxing,
+        relaxation_s: t.relaxation_s,
+    }
+}

@@ -1,0 +1,117 @@
+//! A needle: its shape as it is drawn, and what the report of a run tells of it.
+//!
+//! Both lie in cells of the control block: the shape is a latest state, and the log must outlive the process that writes it. Positions are LPS
+//! millimetres in single precision (a hundred-thousandth of a millimetre in a patient), forces newtons.
+
+use bytemuck::{Pod, Zeroable};
+
+/// Nodes of the drawn needle, and of the path, at most.
+pub const NEEDLE_NODES: usize = 64;
+/// Events that the log keeps: a needle that crosses more borders in one run goes on unlogged, and counted.
+pub const NEEDLE_EVENTS: usize = 48;
+
+/// Region of labels at rest, for tissue that is known by more than its CT value.
+pub const LABELS_REGION: &str = "labels";
+/// What it holds: a label for each voxel of the volume, i fastest, under a [`LabelsHeader`].
+pub const LABELS_KIND: &str = "maille.Labels/v1";
+
+/// Head of the region of labels.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct LabelsHeader {
+    /// voxels along i, j, k: those of the volume
+    pub size: [u64; 3],
+}
+
+/// The needle of this tick. Writer: haptic, every tick. Reader: rendering.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct NeedleState {
+    /// simulation time [ns]
+    pub time_ns: u64,
+    /// nodes in use of [`nodes_mm`](Self::nodes_mm)
+    pub nodes: u64,
+    /// nodes in use of [`path_mm`](Self::path_mm); 0: outside
+    pub path_nodes: u64,
+    /// tissue at the tip: row of the scene's table from 1, 0 outside
+    pub tissue: u64,
+    /// half the needle's outer diameter [mm]
+    pub radius_mm: f64,
+    /// length of the path in reference space [mm]
+    pub depth_mm: f64,
+    /// how far the hand is ahead of the tip [mm]
+    pub ahead_mm: f64,
+    /// cutting force, friction along the shaft, force at the base [N]
+    pub parts_n: [f64; 3],
+    /// about the handle [N·mm]
+    pub torque_n_mm: [f64; 3],
+    /// what the rod's solve left [mm]
+    pub residual_mm: f64,
+    /// needle from handle to tip, world
+    pub nodes_mm: [[f32; 3]; NEEDLE_NODES],
+    /// path from skin to tip, reference
+    pub path_mm: [[f32; 3]; NEEDLE_NODES],
+}
+
+/// The tip met something that holds it, in [`NeedleEvent::kind`].
+pub const NEEDLE_MET: u64 = 1;
+/// The tip cut into something.
+pub const NEEDLE_PUNCTURED: u64 = 2;
+/// The needle left the patient.
+pub const NEEDLE_WITHDRAWN: u64 = 3;
+
+/// Something that happened to the tip.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct NeedleEvent {
+    /// simulation time [ns]
+    pub time_ns: u64,
+    /// `NEEDLE_…`
+    pub kind: u64,
+    /// row of the scene's table from 1
+    pub tissue: u64,
+    /// where in reference space [mm]
+    pub reference_mm: [f64; 3],
+    /// path cut so far [mm]
+    pub depth_mm: f64,
+    /// force at the tip just before [N]
+    pub force_n: f64,
+    /// phase of the breath in [0, 1), 0 = end of inspiration; −1 where nobody breathes
+    pub phase: f64,
+}
+
+/// What a needle did in a run. Writer: haptic, a few times a second and at each event; one that was restarted goes on with it. Reader: supervisor.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct NeedleLog {
+    /// events so far; the first [`NEEDLE_EVENTS`] are kept
+    pub count: u64,
+    /// ticks inside the patient
+    pub ticks_inside: u64,
+    /// time inside the patient [ns]
+    pub inside_ns: u64,
+    /// largest force given to the hand [N], and torque [N·mm]
+    pub peaks: [f64; 2],
+    /// largest residual of a tick's solve [mm]
+    pub residual_mm: f64,
+    /// the path's tip to the target's centre, in reference space: now, and least [mm]
+    pub to_target_mm: [f64; 2],
+    /// largest depth of the path [mm]
+    pub deepest_mm: f64,
+    /// nodes in use of `path_mm`
+    pub path_nodes: u64,
+    /// the deepest path, reference
+    pub path_mm: [[f32; 3]; NEEDLE_NODES],
+    /// what happened
+    pub events: [NeedleEvent; NEEDLE_EVENTS],
+}
+
+impl NeedleState {
+    /// The state, if its numbers can be used.
+    pub fn checked(self) -> Option<Self> {
+        let (nodes, path) = (self.nodes as usize, self.path_nodes as usize);
+        let counts = nodes <= NEEDLE_NODES && path <= NEEDLE_NODES && self.radius_mm > 0.0 && self.radius_mm.is_finite();
+        let finite = |points: &[[f32; 3]]| points.iter().flatten().all(|v| v.is_finite());
+        (counts && finite(&self.nodes_mm[..nodes]) && finite(&self.path_mm[..path])).then_some(self)
+    }
+}
