@@ -5,10 +5,12 @@
 //! prints the table with the worst value seen for each invariant, and asserts that every hard case that an effect declares in the scene's
 //! registry is there. Debug and release: `cargo test --test stability -- --nocapture`, and the same with `--release`.
 
+mod breathing;
 mod chainmail;
 mod haptics;
 mod inversion;
 mod made;
+mod needle;
 mod rendering;
 
 use std::{
@@ -120,7 +122,7 @@ macro_rules! hard_cases {
 }
 
 fn all() -> impl Iterator<Item = &'static Case> {
-    [chainmail::CASES, inversion::CASES, haptics::CASES, rendering::CASES].into_iter().flatten()
+    [chainmail::CASES, inversion::CASES, haptics::CASES, breathing::CASES, needle::CASES, rendering::CASES].into_iter().flatten()
 }
 
 #[test]

@@ -4,7 +4,10 @@ use crate::{
     Case, Digest, Invariant, Seen, at_most, hard_cases,
     made::{BAD, Random, volume},
 };
-use maille_raycast::{Camera, Extras, Kernel, Motion, Picture, Settings, Skip, Step, Transfer, Warp, WarpOptions, render_extra};
+use maille_raycast::{
+    Camera, Extras, Kernel, Motion, Picture, Probe, Settings, Skip, Step, Transfer, Ultrasound, Warp, WarpOptions, render_extra,
+    ultrasound::echoes,
+};
 use maille_volume::{BrickSource, BrickedVolume, VectorField};
 
 /// What must hold of every picture. Packets of rays and single rays sum in another order: two steps of 255 apart at most, but where a ray grazes
@@ -204,8 +207,64 @@ fn displacement_larger_than_the_volume() -> Seen {
     bench.seen()
 }
 
+/// What must hold of echoes.
+const ECHOES: &[Invariant] = &[
+    at_most("amplitudes not finite or below 0", "", 0.0),
+    at_most("amplitudes above a perfect mirror's, as a part of it", "1", 1.0),
+    at_most("probes of no sense that were drawn", "", 0.0),
+];
+
+/// Fans over a patient; the loudest echo and what is no amplitude.
+fn fans(source: &BrickedVolume, probes: &[Probe]) -> Seen {
+    let mut bench = Bench::new();
+    for &probe in probes {
+        for settings in [Ultrasound::new(probe), Ultrasound { speckle: false, step_mm: 1.0, ..Ultrasound::new(probe) }] {
+            let found = echoes(source, &settings, None).expect("a probe that makes sense");
+            bench.worst[0] += found.amplitude.iter().filter(|a| !(a.is_finite() && **a >= 0.0)).count() as f64;
+            bench.worst[1] = found.amplitude.iter().fold(bench.worst[1], |m, a| m.max(f64::from(*a)));
+            found.amplitude.iter().for_each(|a| bench.digest.add(a.to_bits().into()));
+        }
+    }
+    bench.seen()
+}
+
+fn a_probe_in_the_air() -> Seen {
+    let far = Probe::convex([20.0, -300.0, 16.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]);
+    let away = Probe::convex([20.0, -5.0, 16.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]);
+    fans(&patient([1.0; 3]), &[far, away, Probe::convex([1e6; 3], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])])
+}
+
+fn bone_and_gas_before_tissue() -> Seen {
+    let layered = volume([48, 48, 40], [1.0; 3], |[_, j, _]| match j {
+        4..6 => 3071.0,
+        12..14 => -1024.0,
+        20..21 => 1500.0,
+        _ => 45.0,
+    });
+    let down = |y: f64| Probe::convex([24.0, y, 20.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]);
+    fans(&layered, &[down(0.0), down(4.5), down(12.5), down(30.0)])
+}
+
+fn a_probe_that_looks_nowhere() -> Seen {
+    let (source, mut bench) = (patient([1.0; 3]), Bench::new());
+    let good = Probe::convex([20.0, 0.0, 16.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]);
+    let mut refused = |probe: Probe| bench.worst[2] += f64::from(u8::from(echoes(&source, &Ultrasound::new(probe), None).is_some()));
+    refused(Probe { direction: [0.0; 3], ..good });
+    refused(Probe { across: good.direction, ..good });
+    for bad in BAD.into_iter().filter(|v| !v.is_finite()) {
+        refused(Probe { face: [bad, 0.0, 0.0], ..good });
+        refused(Probe { direction: [bad, 1.0, 0.0], ..good });
+        refused(Probe { across: [1.0, bad, 0.0], ..good });
+        refused(Probe { depth_mm: bad, ..good });
+        refused(Probe { frequency_mhz: bad, ..good });
+    }
+    refused(Probe { angle_deg: 180.0, ..good });
+    refused(Probe { radius_mm: -1.0, ..good });
+    bench.seen()
+}
+
 const fn case(name: &'static str, invariants: &'static [Invariant], run: fn() -> Seen) -> Case {
-    Case { engine: "rendering", name, effects: &["view", "breathing"], invariants, run }
+    Case { engine: "rendering", name, effects: &["view", "breathing", "ultrasound"], invariants, run }
 }
 
 pub(crate) const CASES: &[Case] = &[
@@ -215,6 +274,9 @@ pub(crate) const CASES: &[Case] = &[
     case("opaque and empty transfer functions", HOLDS, opaque_and_empty),
     case("cameras of no sense", HOLDS, cameras_of_no_sense),
     case("displacement larger than the volume", WARPED, displacement_larger_than_the_volume),
+    case("a probe in the air", ECHOES, a_probe_in_the_air),
+    case("bone and gas before tissue", ECHOES, bone_and_gas_before_tissue),
+    case("a probe that looks nowhere", ECHOES, a_probe_that_looks_nowhere),
 ];
 
 hard_cases! {
@@ -224,4 +286,7 @@ hard_cases! {
     opaque_and_empty_transfer_functions => 3,
     cameras_of_no_sense => 4,
     displacement_larger_than_the_volume => 5,
+    a_probe_in_the_air => 6,
+    bone_and_gas_before_tissue => 7,
+    a_probe_that_looks_nowhere => 8,
 }

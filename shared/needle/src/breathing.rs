@@ -3,6 +3,8 @@
 //! x = X + u(X, t) takes reference to world [mm, LPS]. Whoever owns a motion model puts it under the coefficients of the tick and hands it in;
 //! the tick asks two or three values a path node, one gradient, and one inverse warm from the last answer.
 
+use std::cell::Cell;
+
 /// A breathing field at one moment.
 pub trait Breathing {
     /// u(X) [mm].
@@ -53,5 +55,45 @@ impl Breathing for AtRest {
 
     fn to_reference(&self, world: [f64; 3], _: [f64; 3]) -> [f64; 3] {
         world
+    }
+}
+
+/// A field that may be no number, made safe: where it is none nothing is displaced, and that is counted.
+pub(crate) struct Sound<'a, B: ?Sized> {
+    of: &'a B,
+    wrong: Cell<u64>,
+}
+
+impl<'a, B: Breathing + ?Sized> Sound<'a, B> {
+    pub fn new(of: &'a B) -> Self {
+        Self { of, wrong: Cell::new(0) }
+    }
+
+    /// Answers that were no numbers.
+    pub fn wrong(&self) -> u64 {
+        self.wrong.get()
+    }
+
+    fn or(&self, answer: [f64; 3], otherwise: [f64; 3]) -> [f64; 3] {
+        // a displacement or place beyond a kilometre is as little one as infinity
+        if answer.iter().all(|v| v.abs() < 1e6) {
+            return answer;
+        }
+        self.wrong.set(self.wrong.get() + 1);
+        otherwise
+    }
+}
+
+impl<B: Breathing + ?Sized> Breathing for Sound<'_, B> {
+    fn displacement(&self, reference: [f64; 3]) -> [f64; 3] {
+        self.or(self.of.displacement(reference), [0.0; 3])
+    }
+
+    fn gradient(&self, reference: [f64; 3]) -> [[f64; 3]; 3] {
+        self.of.gradient(reference).map(|row| self.or(row, [0.0; 3]))
+    }
+
+    fn to_reference(&self, world: [f64; 3], guess: [f64; 3]) -> [f64; 3] {
+        self.or(self.of.to_reference(world, guess), world)
     }
 }

@@ -26,6 +26,7 @@
 //! one stands, counted; jumps are counted and change nothing (no force exceeds the limit); a path that is full stops the tip's nodes, not
 //! the needle. Cost: 20–40 µs with 25 nodes. Allocation: none. Not here: slew limits and fading (`maille-contact`), where tissue comes from.
 
+use crate::breathing::Sound;
 use crate::error::{NeedleError, check};
 use crate::events::{Event, EventKind};
 use crate::limits::{MAX_SKIN_HALVINGS, MAX_SKIN_STEPS, MAX_STEP_S};
@@ -171,6 +172,8 @@ pub struct Faults {
     pub path_full: u64,
     /// ticks in which the handle itself was inside tissue
     pub buried: u64,
+    /// ticks in which breathing was no number somewhere: taken as none there
+    pub invalid_breathing: u64,
 }
 
 /// A needle on a device; see the module.
@@ -286,6 +289,8 @@ impl NeedleTool {
     /// One tick. Allocates nothing; bounded work.
     pub fn tick<B: Breathing + ?Sized, T: Tissue + ?Sized>(&mut self, inputs: &Inputs<'_, B, T>) -> Outputs {
         let mut told: Told = [None; crate::limits::MAX_EVENTS];
+        let sound = Sound::new(inputs.breathing);
+        let inputs = &Inputs { dt_s: inputs.dt_s, handle: inputs.handle, held: inputs.held, breathing: &sound, tissue: inputs.tissue };
         let dt = if inputs.dt_s.is_finite() { inputs.dt_s.clamp(1e-6, MAX_STEP_S) } else { 1e-3 };
         let held = inputs.held || self.path.nodes().is_empty();
         self.accept(&inputs.handle, held);
@@ -299,6 +304,7 @@ impl NeedleTool {
         out.path_nodes = self.path.nodes().len();
         out.handle = HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() };
         out.events = told;
+        self.faults.invalid_breathing += u64::from(sound.wrong() > 0);
         out.faults = self.faults;
         out
     }

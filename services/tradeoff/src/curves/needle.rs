@@ -3,12 +3,15 @@
 //! A needle of 150 mm, clamped at its base, bent by a dead load across its tip. The truth is EI θ″ = −F cos θ by shooting with
 //! fourth-order Runge–Kutta, as in the rod's own tests.
 
+use super::mean_and_worst;
 use crate::{
     TradeoffError,
     clock::spent,
     curve::{Curve, KnobOf, Setting, Subject, Theory},
 };
-use maille_needle::{Attachment, Gauge, Rod, RodParameters, V3};
+use maille_needle::{
+    Attachment, Breathing, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Rod, RodParameters, V3,
+};
 
 const ERROR: &str = "distance of the tip from the elastica's";
 const TRUTH: &str = "the elastica by shooting (Runge–Kutta, 4 000 steps)";
@@ -17,7 +20,7 @@ pub(super) static CURVES: &[Curve] = &[
     Curve {
         name: "needle.nodes",
         engine: "needle",
-        knob: KnobOf::Engine(Some([15.0, 25.0, 50.0])),
+        knob: KnobOf::Registry("needle.nodes"),
         title: "nodes of the rod",
         error: ERROR,
         unit: "mm",
@@ -41,7 +44,84 @@ pub(super) static CURVES: &[Curve] = &[
         ),
         bench: |_| bench([1e-2, 1e-3, 1e-4, 1e-6, 1e-9].map(|t| (t, 25, t)).to_vec()),
     },
+    Curve {
+        name: "needle.path_spacing_mm",
+        engine: "needle",
+        knob: KnobOf::Registry("needle.path_spacing_mm"),
+        title: "distance of nodes of the path that the tip has cut",
+        error: "mean distance of the path's line from the truth's (largest: at its worst)",
+        unit: "mm",
+        truth: "the same insertion with nodes every 0.5 mm",
+        timed: "one tick of a needle 80 mm deep, contact and breathing included",
+        theory: Theory::Not(
+            "each node holds a spring and friction of its own, so that another spacing also bends the needle a little otherwise while it goes in",
+        ),
+        bench: |_| path_spacing(&[20.0, 10.0, 5.0, 2.5, 1.25]),
+    },
 ];
+
+/// Tissue that sways: in it a straight needle cuts a path that is curved at rest.
+struct Sway(f64);
+
+impl Breathing for Sway {
+    fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
+        let share = (x[2] / 60.0).clamp(0.0, 1.0);
+        [self.0 * share * share, 0.0, 0.0]
+    }
+}
+
+/// Liver below the skin at z = 0.
+fn below(x: [f64; 3]) -> u8 {
+    u8::from(x[2] >= 0.0)
+}
+
+/// Distance of a point from a line through points [mm].
+fn off_line(at: V3, line: &[V3]) -> f64 {
+    let from = |w: &[V3]| {
+        let (d, to) = (w[1] - w[0], at - w[0]);
+        let share = (to.dot(&d) / d.norm_squared().max(1e-12)).clamp(0.0, 1.0);
+        (to - d * share).norm()
+    };
+    line.windows(2).map(from).fold(f64::INFINITY, f64::min)
+}
+
+fn path_spacing(spacings: &[f64]) -> Result<Vec<Subject>, TradeoffError> {
+    let fail = |e: maille_needle::NeedleError| TradeoffError::Bench("needle", e.to_string());
+    let gauge = Gauge::of(16).map_err(fail)?.with_bending(EI);
+    let inserted = |path_spacing_mm: f64| -> Result<NeedleTool, TradeoffError> {
+        let config = NeedleConfig { path_spacing_mm, max_force_n: 20.0, ..NeedleConfig::new(RodParameters::new(&gauge, LENGTH)) };
+        let mut tool = NeedleTool::new(config, MaterialTable::new(&[Material::LIVER_TRAINING]).map_err(fail)?).map_err(fail)?;
+        (0..8000u32).for_each(|n| tick(&mut tool, f64::from(n) * 1e-3));
+        Ok(tool)
+    };
+    let line = |tool: &NeedleTool| -> Vec<V3> { tool.path().nodes().iter().map(|p| p.reference).collect() };
+    let truth = line(&inserted(0.5)?);
+    let mut out = Vec::new();
+    for &spacing in spacings {
+        let mut tool = inserted(spacing)?;
+        let path = line(&tool);
+        let errors = mean_and_worst(truth.iter().map(|&at| off_line(at, &path)));
+        let mut time_s = 8.0;
+        let run = move || {
+            let ticks = 50;
+            spent(|| {
+                for _ in 0..ticks {
+                    time_s += 1e-3;
+                    tick(&mut tool, time_s);
+                }
+            }) / f64::from(ticks)
+        };
+        out.push(Setting::new("", spacing, errors, run));
+    }
+    Ok(vec![Subject { name: "a 16 gauge needle led 80 mm into swaying liver".into(), settings: out }])
+}
+
+/// A tick of a needle that is led in for eight seconds and then held there.
+fn tick(tool: &mut NeedleTool, time_s: f64) {
+    let depth = 10.0 * time_s.min(8.0);
+    let Some(handle) = HandlePose::pointing([0.0, 0.0, depth], [0.0, 0.0, 1.0], LENGTH) else { return };
+    tool.tick(&Inputs { dt_s: 1e-3, handle, held: true, breathing: &Sway(6.0 * (0.8 * time_s).sin()), tissue: &below });
+}
 
 /// Length [mm], bending stiffness [N·mm²].
 const LENGTH: f64 = 150.0;

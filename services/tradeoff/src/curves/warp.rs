@@ -2,7 +2,7 @@
 //!
 //! The field is one wave of shear, whose inverse is known by formula, given to the ray caster on 96³ nodes (which is itself wrong by at most
 //! 0.007 mm). Of the lattice the error is the distance of the rest positions that rays are sent to from the true ones, and `largest` the bound that the
-//! ray caster itself computes for the frame, lattice and knots together. Of the knots it is what they do to the picture.
+//! ray caster itself computes for the patient's lattice. Of the picture's own lattice it is what that does to the picture.
 
 use super::{distance, mean_and_worst, raycast::difference};
 use crate::{
@@ -22,7 +22,7 @@ pub(super) static CURVES: &[Curve] = &[
         engine: "raycast",
         knob: KnobOf::Engine(None),
         title: "distance of the nodes of the lattice on which the field is inverted for a frame",
-        error: "mean distance of rest positions from the true ones (largest: the frame's own bound, knots included)",
+        error: "mean distance of rest positions from the true ones (largest: the patient's lattice's own bound)",
         unit: "mm",
         truth: "the inverse by formula of a wave of shear",
         timed: "the frame's inverse, and the frame",
@@ -31,7 +31,7 @@ pub(super) static CURVES: &[Curve] = &[
              then that of its rays",
         ),
         bench: |c| {
-            let one = |pitch_mm| WarpOptions { tolerance_mm: 0.05, pitch_mm, ..WarpOptions::default() };
+            let one = |pitch_mm| WarpOptions { tolerance_mm: 0.05, pitch_mm };
             bench(c, Error::Position, &[24.0, 16.0, 8.0, 4.0, 2.0].map(|p: f32| (p, one(p))))
         },
     },
@@ -39,29 +39,29 @@ pub(super) static CURVES: &[Curve] = &[
         name: "breathing.picture_tolerance_mm",
         engine: "raycast",
         knob: KnobOf::Registry("breathing.picture_tolerance_mm"),
-        title: "how far from its place a picture may show anything: sets the lattice's pitch, and how far apart the knots of a ray are",
-        error: "mean distance of rest positions from the true ones (largest: the frame's own bound, knots included)",
+        title: "how far from its place a picture may show anything: sets the pitch of the patient's lattice and of the picture's own",
+        error: "mean distance of rest positions from the true ones (largest: the patient's lattice's own bound)",
         unit: "mm",
         truth: "the inverse by formula of a wave of shear",
         timed: "the frame's inverse, and the frame",
         theory: Theory::Not(
-            "the lattice is made finer until the frame's bound is within the tolerance: tolerances that one pitch serves differ in their knots only, and \
+            "the lattice is made finer until the frame's bound is within the tolerance: tolerances that one pitch serves differ in the picture's own lattice only, and \
              the given field itself is wrong by up to 0.007 mm",
         ),
         bench: |c| {
-            // two thirds for the knots, as the rendering service has it
+            // as the rendering service has it
             let one = |tolerance_mm: f32| WarpOptions { tolerance_mm: 0.66 * tolerance_mm, ..WarpOptions::default() };
             bench(c, Error::Bounded, &[1.0, 0.3, 0.1, 0.03, 0.01].map(|t: f32| (t, one(t))))
         },
     },
     Curve {
-        name: "warp.knots",
+        name: "warp.picture_lattice",
         engine: "raycast",
         knob: KnobOf::Engine(None),
-        title: "error allowed between the knots of a ray, where it goes straight",
+        title: "error allowed between the nodes of a picture's own lattice, which follows its rays",
         error: "difference of the picture, root mean square over all channels of all pixels, per cent of full scale",
         unit: "%",
-        truth: "the same frame with knots every half millimetre",
+        truth: "the same frame within four micrometres",
         timed: "the frame's inverse, and the frame",
         theory: Theory::Monotone,
         bench: |c| {
@@ -108,7 +108,7 @@ fn bench(context: &Context, error: Error, options: &[(f32, WarpOptions)]) -> Res
         render_extra(&extras, &*volume, &skip, &camera, &settings, &mut picture).map_err(|e| fail(&e))?;
         Ok(picture)
     };
-    let truth = draw(WarpOptions { longest_mm: 0.5, ..WarpOptions::default() })?;
+    let truth = draw(WarpOptions { tolerance_mm: 0.004, pitch_mm: 4.0 })?;
     for &(value, options) in options {
         let mut options = options;
         let mut warp = Warp::new(volume.info(), options);
