@@ -33,6 +33,8 @@ enum Command {
     Render(commands::render::Args),
     Surface(commands::surface::Args),
     Latency(commands::latency::Args),
+    Tradeoff(commands::tradeoff::Args),
+    Effects(commands::effects::Args),
     #[command(hide = true)]
     LatencyHelper(commands::latency::HelperArgs),
     Doctor(commands::doctor::Args),
@@ -53,6 +55,8 @@ fn main() -> ExitCode {
         Command::Render(args) => commands::render::run(&args),
         Command::Surface(args) => commands::surface::run(&args),
         Command::Latency(args) => commands::latency::run(&args),
+        Command::Tradeoff(args) => commands::tradeoff::run(&args),
+        Command::Effects(args) => commands::effects::run(&args),
         Command::LatencyHelper(args) => commands::latency::help(&args),
         Command::Doctor(args) => commands::doctor::run(&args),
         Command::Clean(args) => commands::clean::run(&args),

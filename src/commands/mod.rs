@@ -8,6 +8,7 @@ pub mod check;
 pub mod clean;
 pub mod deform;
 pub mod doctor;
+pub mod effects;
 pub mod import;
 pub mod info;
 pub mod invert;
@@ -17,6 +18,7 @@ pub mod render;
 pub mod run;
 pub mod service;
 pub mod surface;
+pub mod tradeoff;
 
 /// Why a command ended without doing what was asked.
 #[derive(Debug)]

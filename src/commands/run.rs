@@ -61,7 +61,7 @@ fn device(text: &str) -> Result<Device, String> {
 }
 
 /// A time as a person writes it: a number and ms, s, m or h.
-fn duration(text: &str) -> Result<Duration, String> {
+pub(super) fn duration(text: &str) -> Result<Duration, String> {
     let split = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
     let (number, unit) = text.split_at(split);
     let seconds = match unit {

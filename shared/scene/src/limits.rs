@@ -51,6 +51,7 @@ pub static LIMITS: &[Limit] = limits! {
     deformation.push_scale: 0 ..= 1 [""] |s| Some(s.deformation.push_scale);
     deformation.inversion_tolerance_mm: 0.0001 ..= 1 ["mm"] |s| Some(s.deformation.inversion_tolerance_mm);
     deformation.sampling_order: 1 ..= 3 [""] |s| Some(s.deformation.sampling_order.into());
+    deformation.metric: 0 ..= 1 [""] |s| Some(if s.deformation.metric == crate::sections::Metric::Cubic { 0.0 } else { 1.0 });
     deformation.rate_hz: 1 ..= 1000 ["Hz"] |s| Some(s.deformation.rate_hz);
     deformation.threads: 1 ..= 256 [""] |s| s.deformation.threads.map(|n| n as f64);
     haptic.rate_hz: 100 ..= 4000 ["Hz"] |s| Some(s.haptic.rate_hz);

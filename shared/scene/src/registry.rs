@@ -4,7 +4,7 @@
 //! ([`crate::plan`]), so that what no entry asks for is not there at run time. Entries with `available: false` are
 //! declared for a later part: a scene that asks for one is refused with a sentence saying so.
 
-use crate::scene::Scene;
+use crate::{scene::Scene, sections::Metric};
 use maille_volume::brick::{Brick, EDGE};
 
 /// A process that a plan may start.
@@ -412,6 +412,31 @@ pub static KNOBS: &[Knob] = &[
         cost: "frame time",
         get: |s| s.breathing.picture_tolerance_mm,
         set: |s, v| s.breathing.picture_tolerance_mm = v,
+    },
+    Knob {
+        name: "deformation.metric",
+        effect: "deformation",
+        summary: "shape of the regions in which neighbours may move: 0 cubic, 1 round",
+        defaults: [0.0, 0.0, 0.0],
+        error: "distance of displacements from those of elastic tissue under the same push [mm]",
+        truth: "a linear-elastic solution on the same grid",
+        cost: "step time: 26 links an element, one by one",
+        get: |s| match s.deformation.metric {
+            Metric::Cubic => 0.0,
+            Metric::Round => 1.0,
+        },
+        set: |s, v| s.deformation.metric = if v == 0.0 { Metric::Cubic } else { Metric::Round },
+    },
+    Knob {
+        name: "haptic.contact_stiffness_n_per_mm",
+        effect: "contact",
+        summary: "stiffness of the coupling between proxy and device; lowered where the device could not render it passively",
+        defaults: [0.5, 0.5, 0.5],
+        error: "depth of the tip in a rigid wall that a hand presses with 1 N [mm]",
+        truth: "a rigid wall: nothing goes in",
+        cost: "no time: distance to the bound beyond which the device is not passive",
+        get: |s| s.haptic.contact_stiffness_n_per_mm,
+        set: |s, v| s.haptic.contact_stiffness_n_per_mm = v,
     },
 ];
 

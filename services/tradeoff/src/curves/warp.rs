@@ -1,0 +1,117 @@
+//! Rays through breathing tissue: how exactly the field is inverted for a frame.
+//!
+//! The field is one wave of shear, whose inverse is known by formula, given to the ray caster on 96³ nodes (which is itself wrong by at most
+//! 0.007 mm). Of the lattice the error is the distance of the rest positions that rays are sent to from the true ones, and `largest` the bound that the
+//! ray caster itself computes for the frame, lattice and knots together. Of the knots it is what they do to the picture.
+
+use super::{distance, mean_and_worst, raycast::difference};
+use crate::{
+    TradeoffError,
+    clock::spent,
+    curve::{Context, Curve, KnobOf, Setting, Subject, Theory},
+};
+use maille_phantom::Kind;
+use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Warp, WarpOptions, render_extra};
+use maille_testkit::{Displacement as _, SinusoidalShear, sample_displacement};
+use maille_volume::{BrickSource, Grid};
+use std::sync::Arc;
+
+pub(super) static CURVES: &[Curve] = &[
+    Curve {
+        name: "warp.pitch",
+        engine: "raycast",
+        knob: KnobOf::Engine(None),
+        title: "distance of the nodes of the lattice on which the field is inverted for a frame",
+        error: "mean distance of rest positions from the true ones (largest: the frame's own bound, knots included)",
+        unit: "mm",
+        truth: "the inverse by formula of a wave of shear",
+        timed: "the frame's inverse, and the frame",
+        theory: Theory::Not(
+            "the lattice's error falls as the square of its pitch, down to the given field's own; a coarse lattice costs next to nothing, and the frame's time is \
+             then that of its rays",
+        ),
+        bench: |c| {
+            let one = |pitch_mm| WarpOptions { tolerance_mm: 0.05, pitch_mm, ..WarpOptions::default() };
+            bench(c, Error::Position, &[24.0, 16.0, 8.0, 4.0, 2.0].map(|p: f32| (p, one(p))))
+        },
+    },
+    Curve {
+        name: "warp.tolerance",
+        engine: "raycast",
+        knob: KnobOf::Engine(None),
+        title: "error allowed in a sample's rest position: sets how far apart the knots of a ray are, between which it goes straight",
+        error: "difference of the picture, root mean square over all channels of all pixels, per cent of full scale",
+        unit: "%",
+        truth: "the same frame with knots every half millimetre",
+        timed: "the frame's inverse, and the frame",
+        theory: Theory::Monotone,
+        bench: |c| {
+            let one = |tolerance_mm| WarpOptions { tolerance_mm, ..WarpOptions::default() };
+            bench(c, Error::Picture, &[0.8, 0.4, 0.2, 0.1, 0.05, 0.02].map(|t: f32| (t, one(t))))
+        },
+    },
+];
+
+/// What is compared with what.
+#[derive(Clone, Copy, PartialEq)]
+enum Error {
+    /// rest positions with the formula's
+    Position,
+    /// the picture with one whose rays have knots everywhere
+    Picture,
+}
+
+fn bench(context: &Context, error: Error, options: &[(f32, WarpOptions)]) -> Result<Vec<Subject>, TradeoffError> {
+    let fail = |e: &dyn std::fmt::Display| TradeoffError::Bench("raycast", e.to_string());
+    let patient = context.patients.made(Kind::Head, context.effort);
+    let volume = Arc::clone(&patient.volume);
+    let grid = volume.info().grid.clone();
+    let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64);
+    let mut nodes = Grid::axis_aligned([96; 3], extent.map(|e| e / 95.0));
+    (nodes.origin, nodes.direction) = (grid.origin, grid.direction);
+    let shear = SinusoidalShear { normal: [1.0, 0.0, 0.0], along: [0.0, 0.6, 0.8], amplitude: 10.0, wavelength: 200.0, phase: 0.4 };
+    let motion = Arc::new(Motion::new(&[sample_displacement(&nodes, &shear)]).map_err(|e| fail(&e))?);
+    let settings = Arc::new(Settings { opacity_end: 0.99, ..Settings::volume(Preset::Skin.transfer()) });
+    let skip = Arc::new(Skip::new(&*volume, &settings));
+    let camera = Camera::around(volume.info());
+    let [width, height] = context.effort.pick([160, 128], [612, 507]);
+    let mut out = Vec::new();
+    let draw = |options: WarpOptions| -> Result<Picture, TradeoffError> {
+        let mut warp = Warp::new(volume.info(), options);
+        warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
+        let mut picture = Picture::new(width, height);
+        let extras = Extras { warp: Some(&warp), ..Extras::default() };
+        render_extra(&extras, &*volume, &skip, &camera, &settings, &mut picture).map_err(|e| fail(&e))?;
+        Ok(picture)
+    };
+    let truth = draw(WarpOptions { longest_mm: 0.5, ..WarpOptions::default() })?;
+    for &(value, options) in options {
+        let mut warp = Warp::new(volume.info(), options);
+        let report = warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
+        let places = (1..=4000u32).map(|n| [0.754_877_7, 0.569_840_3, 0.362_154_8].map(|a: f64| 0.15 + 0.7 * (f64::from(n) * a).fract()));
+        let errors = mean_and_worst(places.map(|share| {
+            let index: [f64; 3] = std::array::from_fn(|c| share[c] * (grid.size[c] - 1) as f64);
+            let world = grid.world_from_index(index);
+            let v = shear.inverse(world);
+            let found = grid.world_from_index(warp.rest_index(index.map(|i| i as f32)).map(f64::from));
+            distance(found, std::array::from_fn(|c| world[c] + v[c]))
+        }));
+        let (volume, motion, settings, skip) = (Arc::clone(&volume), Arc::clone(&motion), Arc::clone(&settings), Arc::clone(&skip));
+        let (mut picture, mut moment) = (Picture::new(width, height), 0.0f32);
+        let run = move || {
+            moment += 0.03;
+            let amount = 0.85 + 0.15 * moment.sin();
+            spent(|| {
+                let updated = warp.update(volume.info(), &motion, &[amount]).is_ok();
+                let extras = Extras { warp: Some(&warp), ..Extras::default() };
+                updated && render_extra(&extras, &*volume, &skip, &camera, &settings, &mut picture).is_ok()
+            })
+        };
+        let errors = match error {
+            Error::Position => [errors[0], f64::from(report.error_mm)],
+            Error::Picture => difference(&draw(options)?, &truth),
+        };
+        out.push(Setting::new("", f64::from(value), errors, run).called(value.to_string()));
+    }
+    Ok(vec![Subject { name: patient.name, settings: out }])
+}

@@ -1,0 +1,564 @@
+//! What each effect costs: whole runs with it and without it.
+//!
+//! A base scene is taken apart (no tool, no effects: the view alone) and put together again for each effect of the registry with all it depends on.
+//! Each such scene is run headless by this executable's own `run`, and read from its report: ticks, steps and frames (p50, p99), segments, private
+//! memory, processes. **Added** by an effect is its run minus the run of what it depends on, nothing else; of `everything` it is all effects that get
+//! along minus the view alone. With several rounds, whole rounds follow each other and each figure is the median.
+//!
+//! A later effect takes part by standing in the registry; what it needs of tool or tissue to have anything to do is a line in [`prepare`]. Times are
+//! of all processes running at once on this machine, so they hold what these take from each other.
+
+use crate::{TradeoffError, interruption, io, measure::Quartiles, report::load_1m};
+use maille_scene::{
+    EffectSetting, Scene,
+    registry::{CalledBy, EFFECTS, Effect, effect},
+    sections,
+    tool::{Shape, ToolKind},
+};
+use serde::Serialize;
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt, fs,
+    os::unix::process::CommandExt as _,
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    sync::atomic::{AtomicBool, Ordering::Relaxed},
+    time::Duration,
+};
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct EffectsOptions {
+    /// this program
+    pub program: PathBuf,
+    /// base scene; none: a small made head
+    pub scene: Option<PathBuf>,
+    /// another volume in it
+    pub volume: Option<PathBuf>,
+    /// of each run
+    pub duration: Duration,
+    /// how often all is run
+    pub rounds: usize,
+    /// effects to look at; none: all
+    pub only: Vec<String>,
+}
+
+/// p50 and p99 of a duration.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[allow(missing_docs)] // their names
+pub struct Pair {
+    pub p50: f64,
+    pub p99: f64,
+}
+
+/// Figures of a run, or differences of two.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Measure {
+    /// compute of a haptic tick [µs]
+    pub tick_us: Pair,
+    /// from a tool move to its commit [µs]
+    pub step_us: Pair,
+    /// a frame [ms]
+    pub frame_ms: Pair,
+    /// all segments [MiB]
+    pub segments_mib: f64,
+    /// private memory of all services [MiB]
+    pub private_mib: f64,
+    /// services
+    pub processes: f64,
+}
+
+impl Measure {
+    /// Every number of two measures through a function.
+    fn with(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
+        let pair = |a: Pair, b: Pair| Pair { p50: f(a.p50, b.p50), p99: f(a.p99, b.p99) };
+        Self {
+            tick_us: pair(self.tick_us, other.tick_us),
+            step_us: pair(self.step_us, other.step_us),
+            frame_ms: pair(self.frame_ms, other.frame_ms),
+            segments_mib: f(self.segments_mib, other.segments_mib),
+            private_mib: f(self.private_mib, other.private_mib),
+            processes: f(self.processes, other.processes),
+        }
+    }
+
+    /// Median of each number.
+    fn median(of: &[Self]) -> Self {
+        let number = |f: fn(&Self) -> f64| Quartiles::of(of.iter().map(f).collect()).median;
+        Self {
+            tick_us: Pair { p50: number(|m| m.tick_us.p50), p99: number(|m| m.tick_us.p99) },
+            step_us: Pair { p50: number(|m| m.step_us.p50), p99: number(|m| m.step_us.p99) },
+            frame_ms: Pair { p50: number(|m| m.frame_ms.p50), p99: number(|m| m.frame_ms.p99) },
+            segments_mib: number(|m| m.segments_mib),
+            private_mib: number(|m| m.private_mib),
+            processes: number(|m| m.processes),
+        }
+    }
+
+    /// From the JSON of a run's report; what a run has no process for is nought.
+    fn of(report: &serde_json::Value) -> Self {
+        let n = |path: &str| report.pointer(path).and_then(serde_json::Value::as_f64).unwrap_or(0.0);
+        let pair = |path: &str| Pair { p50: n(&format!("{path}/p50")), p99: n(&format!("{path}/p99")) };
+        let services = report["services"].as_object();
+        Self {
+            tick_us: pair("/services/haptic/tick_us"),
+            step_us: pair("/services/deformation/step_us"),
+            frame_ms: pair("/services/rendering/frame_ms"),
+            segments_mib: n("/store/segment_mib"),
+            private_mib: services.map_or(0.0, |s| s.values().filter_map(|s| s["private_mib"].as_f64()).sum()),
+            processes: services.map_or(0.0, |s| s.len() as f64),
+        }
+    }
+}
+
+/// A set of effects that was run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Run {
+    /// names, beside `view`
+    pub effects: Vec<String>,
+    /// median over the rounds
+    pub measure: Measure,
+    /// services that ran
+    pub processes: Vec<String>,
+}
+
+/// What an effect adds.
+#[derive(Clone, Debug, Serialize)]
+pub struct Added {
+    /// its name, or `everything`
+    pub effect: String,
+    /// what it was compared with, `view` first
+    pub over: Vec<String>,
+    /// the difference; none when it could not be run
+    pub added: Option<Measure>,
+    /// services that it brings
+    pub processes_added: Vec<String>,
+    /// why it could not be run, or what it is
+    pub note: Option<String>,
+}
+
+/// What all effects cost.
+#[derive(Clone, Debug, Serialize)]
+pub struct EffectsReport {
+    /// name of the base scene
+    pub scene: String,
+    /// of each run [s]
+    pub duration_s: f64,
+    /// how often all was run
+    pub rounds: usize,
+    /// what it ran on
+    pub processor: String,
+    /// how many of them
+    pub processors: usize,
+    /// load at the end
+    pub load_1m: f64,
+    /// the command that does it again
+    pub command: String,
+    /// effect by effect, in the registry's order, then `everything`
+    pub effects: Vec<Added>,
+    /// the runs behind them
+    pub runs: Vec<Run>,
+}
+
+/// A small made head, pressed ever again: small pictures, so that what an effect adds to a frame is seen beside it.
+const BASE: &str = r#"
+name = "effects"
+description = "a small made head, pressed at the cheek"
+[volume]
+phantom = "head"
+size = 96
+[tool]
+radius_mm = 3.0
+[tool.approach]
+from = [0.81, 0.07, 0.317]
+toward = [0.68, 0.275, 0.317]
+press_mm = 6.0
+period_s = 1.5
+[rendering]
+size = [320, 240]
+section_size = [160, 120]
+transfer = "skin"
+from = [0.75, -1.0, 0.0]
+distance = 0.7
+"#;
+
+/// Gives an effect something to do: what it needs of the scene beyond its name.
+fn prepare(scene: &mut Scene, name: &str) {
+    match name {
+        "cutting" => {
+            if let Some(tool) = &mut scene.tool {
+                tool.kind = ToolKind::Blade;
+            }
+        }
+        "palpation" => {
+            if let Some(tool) = &mut scene.tool {
+                (tool.shape, tool.radius_mm) = (Shape::Finger, tool.radius_mm.max(5.0));
+            }
+        }
+        "plasticity" => {
+            scene.deformation.relaxation = sections::Relaxation::Elastic;
+            scene.tissues.iter_mut().for_each(|row| row.plastic = 0.3);
+        }
+        _ => {}
+    }
+}
+
+/// An effect and all it depends on, `view` and what every scene has left out.
+fn closure(name: &str) -> BTreeSet<&'static str> {
+    let mut all = BTreeSet::new();
+    let mut wanted = vec![name];
+    while let Some(name) = wanted.pop() {
+        if let Some(e) = effect(name).filter(|e| e.called_by != CalledBy::Always)
+            && all.insert(e.name)
+        {
+            wanted.extend(e.depends_on);
+        }
+    }
+    all
+}
+
+/// The scene with these effects and no others.
+fn scene_of(base: &Scene, effects: &BTreeSet<&str>) -> Scene {
+    let mut scene = base.clone();
+    scene.effects.clear();
+    for name in effects {
+        if effect(name).is_some_and(|e| e.called_by == CalledBy::Effects) {
+            scene.effects.insert((*name).into(), EffectSetting::Switch(true));
+        }
+    }
+    let has_tool = effects.iter().any(|n| effect(n).is_some_and(|e| e.called_by == CalledBy::Section("tool")));
+    if !has_tool {
+        scene.tool = None;
+    }
+    for name in effects {
+        prepare(&mut scene, name);
+    }
+    scene.console.enabled = false;
+    scene
+}
+
+/// Whether the scene's text is one that `maille run` takes.
+fn fault(scene: &Scene) -> Option<String> {
+    Scene::parse("made", &scene.to_toml()).err().map(|e| e.to_string())
+}
+
+fn base(options: &EffectsOptions) -> Result<Scene, TradeoffError> {
+    let wrong = |e: maille_scene::SceneError| TradeoffError::Run(e.to_string());
+    let mut scene = match &options.scene {
+        Some(path) => Scene::open(Some(path), None).map_err(wrong)?,
+        None => Scene::parse("the base scene", BASE).map_err(wrong)?,
+    };
+    if let Some(volume) = &options.volume {
+        if !volume.exists() {
+            return Err(TradeoffError::Run(format!("there is no volume {}", volume.display())));
+        }
+        scene.replace_volume(volume.clone());
+    }
+    if let Some(file) = &scene.volume.file {
+        // the made scenes lie elsewhere
+        scene.volume.file = Some(fs::canonicalize(file).map_err(io(format!("{} cannot be found", file.display())))?);
+    }
+    if scene.tool.is_none() {
+        scene.tool = Scene::builtin_default().tool;
+    }
+    Ok(scene)
+}
+
+/// Runs everything.
+///
+/// # Errors
+/// When the base scene is none, a run fails, or the user ends it.
+pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<EffectsReport, TradeoffError> {
+    let base = base(options)?;
+    let known: Vec<&'static Effect> = EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always).collect();
+    if let Some(name) = options.only.iter().find(|n| !known.iter().any(|e| e.name == **n)) {
+        let names = known.iter().map(|e| e.name).collect::<Vec<_>>().join(", ");
+        return Err(TradeoffError::Run(format!("no effect is named {name:?}; there are {names}")));
+    }
+    let looked_at = |e: &&&Effect| options.only.is_empty() || options.only.iter().any(|n| n == e.name);
+    let nothing = BTreeSet::new();
+    // (name, with, without), and what cannot be run
+    let mut wanted: Vec<(String, BTreeSet<&str>, BTreeSet<&str>)> = Vec::new();
+    let mut notes: BTreeMap<String, String> = BTreeMap::new();
+    let mut everything: BTreeSet<&str> = BTreeSet::new();
+    let mut left_out = Vec::new();
+    for e in known.iter().filter(looked_at) {
+        let with = closure(e.name);
+        let mut without = with.clone();
+        without.remove(e.name);
+        if let Some(unbuilt) = with.iter().find(|n| !effect(n).is_some_and(|e| e.available)) {
+            notes.insert(e.name.into(), format!("declared for later{}", if *unbuilt == e.name { "" } else { " by what it depends on" }));
+        } else if let Some(fault) = fault(&scene_of(&base, &with)) {
+            notes.insert(e.name.into(), format!("this scene cannot have it: {fault}"));
+        } else {
+            // all together: as long as the scene takes them
+            let union: BTreeSet<&str> = everything.union(&with).copied().collect();
+            if fault_free(&base, &union) {
+                everything = union;
+            } else {
+                left_out.push(e.name);
+            }
+        }
+        wanted.push((e.name.into(), with, without));
+    }
+    if options.only.is_empty() {
+        wanted.push(("everything".into(), everything.clone(), nothing.clone()));
+        if !left_out.is_empty() {
+            notes.insert("everything".into(), format!("without {}", left_out.join(", ")));
+        }
+    }
+
+    let mut sets: Vec<BTreeSet<&str>> = Vec::new();
+    for (name, with, without) in &wanted {
+        if name == "everything" || !notes.contains_key(name) {
+            for set in [without, with] {
+                if !sets.contains(set) {
+                    sets.push(set.clone());
+                }
+            }
+        }
+    }
+    let interrupted = interruption()?;
+    let scratch = Scratch::make()?;
+    let mut measured: Vec<Vec<Measure>> = vec![Vec::new(); sets.len()];
+    let mut processes: Vec<Vec<String>> = vec![Vec::new(); sets.len()];
+    for _ in 0..options.rounds.max(1) {
+        for (n, set) in sets.iter().enumerate() {
+            let names = set.iter().copied().collect::<Vec<_>>().join(" + ");
+            told(if names.is_empty() { "the view alone" } else { &names });
+            let report = run(options, &scene_of(&base, set), &scratch.0, &interrupted)?;
+            measured[n].push(Measure::of(&report));
+            processes[n] = report["services"].as_object().map(|s| s.keys().cloned().collect()).unwrap_or_default();
+        }
+    }
+    let runs: Vec<Run> = sets
+        .iter()
+        .zip(&measured)
+        .zip(processes)
+        .map(|((set, all), processes)| Run { effects: set.iter().map(|n| (*n).into()).collect(), measure: Measure::median(all), processes })
+        .collect();
+    let place = |set: &BTreeSet<&str>| sets.iter().position(|s| s == set);
+    let effects = wanted
+        .into_iter()
+        .map(|(effect, with, without)| {
+            // differences within a round, then their median
+            let both = place(&with).zip(place(&without)).filter(|_| effect == "everything" || !notes.contains_key(&effect));
+            let added = both.map(|(a, b)| {
+                let each: Vec<Measure> = measured[a].iter().zip(&measured[b]).map(|(a, b)| a.with(*b, |a, b| a - b)).collect();
+                Measure::median(&each)
+            });
+            let processes_added =
+                both.map_or(Vec::new(), |(a, b)| runs[a].processes.iter().filter(|p| !runs[b].processes.contains(p)).cloned().collect());
+            let over = std::iter::once("view").chain(without).map(Into::into).collect();
+            let note = notes.get(&effect).cloned();
+            Added { effect, over, added, processes_added, note }
+        })
+        .collect();
+    let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = cpu.lines().find_map(|l| l.strip_prefix("model name")).and_then(|l| l.split(':').nth(1)).unwrap_or("unknown");
+    Ok(EffectsReport {
+        scene: base.name.clone(),
+        duration_s: options.duration.as_secs_f64(),
+        rounds: options.rounds.max(1),
+        processor: model.trim().into(),
+        processors: std::thread::available_parallelism().map_or(1, usize::from),
+        load_1m: load_1m(),
+        command: command(options),
+        effects,
+        runs,
+    })
+}
+
+fn fault_free(base: &Scene, effects: &BTreeSet<&str>) -> bool {
+    fault(&scene_of(base, effects)).is_none()
+}
+
+fn command(options: &EffectsOptions) -> String {
+    let mut words = vec!["maille effects".to_string()];
+    words.extend(options.scene.iter().map(|s| s.display().to_string()));
+    words.extend(options.volume.iter().map(|v| format!("--volume {}", v.display())));
+    words.push(format!("--duration {}s", options.duration.as_secs_f64()));
+    if options.rounds > 1 {
+        words.push(format!("--rounds {}", options.rounds));
+    }
+    words.join(" ")
+}
+
+/// A temporary folder.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn make() -> Result<Self, TradeoffError> {
+        let path = std::env::temp_dir().join(format!("maille-effects-{}", std::process::id()));
+        fs::create_dir_all(&path).map_err(io(format!("{} cannot be made", path.display())))?;
+        Ok(Self(path))
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// One run of a scene, by this executable; its report.
+fn run(options: &EffectsOptions, scene: &Scene, scratch: &Path, interrupted: &AtomicBool) -> Result<serde_json::Value, TradeoffError> {
+    let [file, report, said] = ["scene.toml", "run.json", "run.log"].map(|name| scratch.join(name));
+    fs::write(&file, scene.to_toml()).map_err(io(format!("{} cannot be written", file.display())))?;
+    let _ = fs::remove_file(&report);
+    let log = fs::File::create(&said).map_err(io(format!("{} cannot be written", said.display())))?;
+    let and = log.try_clone().map_err(io("a file cannot be opened twice"))?;
+    let mut child = Command::new(&options.program)
+        .arg0("maille")
+        // its own group: Ctrl-C comes here, and is passed on once
+        .process_group(0)
+        .arg("run")
+        .arg(&file)
+        .args(["--headless", "--duration", &format!("{}ms", options.duration.as_millis()), "--report"])
+        .arg(&report)
+        .stdin(Stdio::null())
+        .stdout(log)
+        .stderr(and)
+        .spawn()
+        .map_err(io(format!("{} cannot be started", options.program.display())))?;
+    let status = loop {
+        match child.try_wait() {
+            Ok(Some(status)) => break status,
+            Ok(None) if interrupted.load(Relaxed) => {
+                end(&mut child);
+                return Err(TradeoffError::Interrupted);
+            }
+            Ok(None) => std::thread::sleep(Duration::from_millis(20)),
+            Err(e) => return Err(io("the run cannot be waited for")(e)),
+        }
+    };
+    let log = fs::read_to_string(&said).unwrap_or_default();
+    let last = || log.lines().rev().take(4).collect::<Vec<_>>().into_iter().rev().collect::<Vec<_>>().join(" | ");
+    if !status.success() {
+        return Err(TradeoffError::Run(format!("a run failed ({status}); it said: {}", last())));
+    }
+    let text = fs::read_to_string(&report).map_err(io(format!("the report of a run cannot be read; it said: {}", last())))?;
+    serde_json::from_str(&text).map_err(|e| TradeoffError::Run(format!("the report of a run is no JSON: {e}")))
+}
+
+/// Asks a run to end, as Ctrl-C does, and waits for it.
+fn end(child: &mut Child) {
+    // not reaped yet, so the id is still this child's
+    let _ = rustix::process::kill_process(rustix::process::Pid::from_child(child), rustix::process::Signal::TERM);
+    let _ = child.wait();
+}
+
+impl EffectsReport {
+    /// The object that `--json` prints.
+    pub fn to_json(&self) -> serde_json::Value {
+        serde_json::to_value(self).unwrap_or_default()
+    }
+
+    /// The self-contained page.
+    pub fn to_html(&self) -> String {
+        crate::page::effects(self)
+    }
+
+    /// A table for a README.
+    pub fn to_markdown(&self) -> String {
+        let mut out = String::from(
+            "| effect | over | tick µs p50, p99 | step µs p50, p99 | frame ms p50, p99 | shared MiB | private MiB | processes |\n|---|---|---|---|---|---|---|---|\n",
+        );
+        for e in &self.effects {
+            let cells = e.added.as_ref().map_or_else(
+                || format!("{} | | | | |", e.note.as_deref().unwrap_or("not measured")),
+                |a| {
+                    let pair = |p: &Pair| format!("{:+.1}, {:+.1}", p.p50, p.p99);
+                    format!(
+                        "{} | {} | {} | {:+.1} | {:+.1} | {}",
+                        pair(&a.tick_us),
+                        pair(&a.step_us),
+                        pair(&a.frame_ms),
+                        a.segments_mib,
+                        a.private_mib,
+                        e.processes_added.join(", ")
+                    )
+                },
+            );
+            out += &format!("| {} | {} | {cells} |\n", e.effect, e.over.join(" + "));
+        }
+        out
+    }
+}
+
+/// What a terminal shows.
+impl fmt::Display for EffectsReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{}, {:.1} s a run, {} round(s), load {:.1}; added by each effect:",
+            self.scene, self.duration_s, self.rounds, self.load_1m
+        )?;
+        writeln!(
+            f,
+            "{:<15} {:>17} {:>19} {:>17} {:>10} {:>11}  {}",
+            "effect", "tick µs p50, p99", "step µs p50, p99", "frame ms p50, p99", "shared MiB", "private MiB", "processes; over"
+        )?;
+        for e in &self.effects {
+            match &e.added {
+                None => writeln!(f, "{:<15} {}", e.effect, e.note.as_deref().unwrap_or("not measured"))?,
+                Some(a) => {
+                    let pair = |p: &Pair| format!("{:+.1}, {:+.1}", p.p50, p.p99);
+                    writeln!(
+                        f,
+                        "{:<15} {:>17} {:>19} {:>17} {:>10} {:>11}  {}; {}{}",
+                        e.effect,
+                        pair(&a.tick_us),
+                        pair(&a.step_us),
+                        pair(&a.frame_ms),
+                        format!("{:+.1}", a.segments_mib),
+                        format!("{:+.1}", a.private_mib),
+                        if e.processes_added.is_empty() { "none".into() } else { e.processes_added.join(", ") },
+                        e.over.join(" + "),
+                        e.note.as_ref().map_or(String::new(), |n| format!(" ({n})"))
+                    )?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_effect_of_the_registry_makes_a_scene_that_runs_or_is_declared_for_later() {
+        let base = Scene::parse("the base scene", BASE).unwrap();
+        for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always && e.available) {
+            let with = closure(e.name);
+            let scene = scene_of(&base, &with);
+            assert_eq!(fault(&scene), None, "{}: give it what it needs in `prepare`", e.name);
+            assert!(scene.has_effect(e.name), "{}", e.name);
+            let mut without = with.clone();
+            assert!(without.remove(e.name));
+            assert!(fault_free(&base, &without) && !scene_of(&base, &without).has_effect(e.name), "{}", e.name);
+        }
+    }
+
+    #[test]
+    fn an_effect_is_compared_with_what_it_depends_on_and_nothing_else() {
+        assert_eq!(closure("plasticity"), ["contact", "deformation", "plasticity", "relaxation"].into());
+        assert_eq!(closure("sections"), ["sections"].into());
+        let base = Scene::parse("the base scene", BASE).unwrap();
+        let alone = scene_of(&base, &BTreeSet::new());
+        assert!(alone.tool.is_none() && alone.effects.is_empty());
+    }
+
+    #[test]
+    fn what_a_report_lacks_is_nought() {
+        let report = serde_json::json!({
+            "services": { "rendering": { "private_mib": 3.0, "frame_ms": { "p50": 4.0, "p99": 5.0 } } },
+            "store": { "segment_mib": 7.0 }
+        });
+        let m = Measure::of(&report);
+        assert_eq!((m.tick_us, m.frame_ms), (Pair::default(), Pair { p50: 4.0, p99: 5.0 }));
+        assert_eq!((m.segments_mib, m.private_mib, m.processes), (7.0, 3.0, 1.0));
+    }
+}
