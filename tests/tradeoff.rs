@@ -83,7 +83,9 @@ fn a_cheap_knob_is_measured_from_the_command_line_and_its_report_holds_what_is_d
     let front = &json["fronts"][0];
     assert_eq!(front["knob"], "haptic.contact_stiffness_n_per_mm");
     let on = front["points"].as_array().unwrap();
-    assert!(on.windows(2).all(|p| number(&p[0], "ratio") <= number(&p[1], "ratio") && number(&p[0], "error") > number(&p[1], "error")));
+    assert!(on.windows(2).all(|p| number(&p[0], "time") <= number(&p[1], "time") && number(&p[0], "error") > number(&p[1], "error")));
+
+    assert_eq!(serde_json::from_str::<Value>(&folder.read("fronts.json")).unwrap()["fronts"], json["fronts"]);
 
     let page = folder.read("tradeoff.html");
     assert_self_contained(&page);

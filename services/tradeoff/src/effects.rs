@@ -496,8 +496,8 @@ impl fmt::Display for EffectsReport {
         )?;
         writeln!(
             f,
-            "{:<15} {:>17} {:>19} {:>17} {:>10} {:>11}  {}",
-            "effect", "tick µs p50, p99", "step µs p50, p99", "frame ms p50, p99", "shared MiB", "private MiB", "processes; over"
+            "{:<15} {:>17} {:>19} {:>17} {:>10} {:>11}  processes; over",
+            "effect", "tick µs p50, p99", "step µs p50, p99", "frame ms p50, p99", "shared MiB", "private MiB"
         )?;
         for e in &self.effects {
             match &e.added {

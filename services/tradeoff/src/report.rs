@@ -9,7 +9,8 @@
 //! | `curves[].subjects[].subject`, `rounds` | what it was measured on; rounds |
 //! | `curves[].subjects[].points[]` | `line`, `label`, `value`, `error`, `worst`, `time_ms` and `ratio` (`q1`, `median`, `q3`), `front`, `is_reference`, `accuracy` |
 //! | `curves[].subjects[].monotone` | `holds`, `expected`, `breaks`, `explanation` |
-//! | `fronts[]` | for each knob of the registry `knob`, `unit`, and `points` from cheap to dear: `value`, `error`, `ratio` (to the setting of `reference`) |
+//! | `fronts[]` | for each curve `name`, `knob` (null where the registry has none), `unit`, and `points` from cheap to dear: `value`, `time` (over that of the setting of `reference`), `error` |
+//! | `skipped[]` | curves that had nothing to be measured on, and what they need |
 
 use crate::{
     Options,
@@ -41,17 +42,19 @@ pub struct MeasuredCurve {
 pub struct FrontPoint {
     /// the knob's value
     pub value: f64,
+    /// time over that of `reference`: the mean over the subjects
+    pub time: f64,
     /// error, in the front's unit: the mean over the subjects
     pub error: f64,
-    /// time over that of `reference`: the mean over the subjects
-    pub ratio: f64,
 }
 
-/// The front of one knob of the registry: what to choose from, from cheap to dear.
+/// The front of one curve: what a governor chooses from, from cheap to dear.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Front {
-    /// the knob
-    pub knob: &'static str,
+    /// the curve
+    pub name: &'static str,
+    /// the registry's knob
+    pub knob: Option<&'static str>,
     /// unit of the errors
     pub unit: &'static str,
     /// settings; of two neighbours the second takes longer and is more accurate
@@ -61,7 +64,6 @@ pub struct Front {
 impl Front {
     /// The front over all subjects of a curve: settings of the line that scenes use, means over the subjects, dominated ones left out.
     fn of(curve: &MeasuredCurve) -> Option<Self> {
-        let knob = curve.knob?;
         let used = curve.subjects.first()?.points.first()?.line;
         let mut points: Vec<FrontPoint> = Vec::new();
         for point in curve.subjects[0].points.iter().filter(|p| p.line == used) {
@@ -69,21 +71,21 @@ impl Front {
             let same: Vec<_> =
                 curve.subjects.iter().filter_map(|s| s.points.iter().find(|p| p.line == used && p.value == point.value)).collect();
             let mean = |of: &dyn Fn(&crate::Point) -> f64| same.iter().map(|p| of(p)).sum::<f64>() / same.len() as f64;
-            points.push(FrontPoint { value, error: mean(&|p| p.error), ratio: mean(&|p| p.ratio.median) });
+            points.push(FrontPoint { value, time: mean(&|p| p.ratio.median), error: mean(&|p| p.error) });
         }
-        points.sort_by(|a, b| a.ratio.total_cmp(&b.ratio).then(a.error.total_cmp(&b.error)));
+        points.sort_by(|a, b| a.time.total_cmp(&b.time).then(a.error.total_cmp(&b.error)));
         let mut best = f64::INFINITY;
         points.retain(|p| {
             let better = p.error < best;
             best = best.min(p.error);
             better
         });
-        Some(Self { knob, unit: curve.unit, points })
+        (!points.is_empty()).then_some(Self { name: curve.name, knob: curve.knob, unit: curve.unit, points })
     }
 
-    /// The most accurate setting that takes at most `ratio` times the time of `reference`; the cheapest where none does.
-    pub fn within(&self, ratio: f64) -> Option<FrontPoint> {
-        self.points.iter().rfind(|p| p.ratio <= ratio).or(self.points.first()).copied()
+    /// The most accurate setting that takes at most `time` times the time of `reference`; the cheapest where none does.
+    pub fn within(&self, time: f64) -> Option<FrontPoint> {
+        self.points.iter().rfind(|p| p.time <= time).or(self.points.first()).copied()
     }
 }
 
@@ -150,9 +152,14 @@ impl Report {
         self.load_1m = load_1m();
     }
 
-    /// The front of a knob of the registry.
-    pub fn front(&self, knob: &str) -> Option<&Front> {
-        self.fronts.iter().find(|f| f.knob == knob)
+    /// The front of a curve.
+    pub fn front(&self, name: &str) -> Option<&Front> {
+        self.fronts.iter().find(|f| f.name == name)
+    }
+
+    /// The fronts alone, with what they were measured on: the file that a governor reads.
+    pub fn fronts_json(&self) -> serde_json::Value {
+        serde_json::json!({ "effort": self.effort, "processor": self.processor, "fronts": self.fronts })
     }
 
     /// The object that `--json` prints.

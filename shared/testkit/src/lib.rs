@@ -3,7 +3,8 @@
 //!
 //! Frame: LPS millimetres; values HU; displacements mm, x = X + u(X) forward and X = x + v(x) back.
 //!
-//! Invariants: every field here is known exactly, by formula; nothing here is estimated. Only tests depend on this crate.
+//! Invariants: every field here is known exactly, by formula; nothing here is estimated. Only tests, and the report of `maille tradeoff`, depend on
+//! this crate.
 
 #![forbid(unsafe_code)]
 
