@@ -219,12 +219,17 @@ pub(crate) fn bars(title: &str, unit: &str, rows: &[(String, f64, Option<f64>)])
     let all = rows.iter().flat_map(|(_, a, b)| [*a, b.unwrap_or(*a)]).filter(|v| v.is_finite());
     let (low, high) = all.fold((0.0f64, 0.0f64), |m, v| (m.0.min(v), m.1.max(v)));
     let (low, high) = if high > low { (low, high) } else { (0.0, 1.0) };
-    let (from, to) = (NAMES + if low < 0.0 { 56.0 } else { 6.0 }, WIDTH - 92.0);
+    let words = |(_, value, upper): &(String, f64, Option<f64>)| {
+        upper.map_or(number(*value), |u| format!("{}, p99 {}", number(*value), number(u))).replace('-', "−")
+    };
+    let room = rows.iter().map(|r| width_of(&words(r))).fold(40.0, f64::max);
+    let (from, to) = (NAMES + 6.0, WIDTH - room - 8.0);
     let at = |v: f64| from + (v - low) / (high - low) * (to - from);
     let mut out = format!("<svg viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" aria-label=\"{}\">", escaped(title));
     let _ = write!(out, "<text class=\"axis\" x=\"0\" y=\"14\">{} [{}]</text>", escaped(title), escaped(unit));
     let _ = write!(out, "<path class=\"grid\" d=\"M{:.1},24V{height}\"/>", at(0.0));
-    for (n, (name, value, upper)) in rows.iter().enumerate() {
+    for (n, row) in rows.iter().enumerate() {
+        let (name, value, upper) = row;
         let y = 30.0 + ROW * n as f64;
         let _ = write!(out, "<text class=\"tick\" x=\"{NAMES}\" y=\"{}\" text-anchor=\"end\">{}</text>", y + 13.0, escaped(name));
         let mut bar = |v: f64, class: &str, thick: f64| {
@@ -240,7 +245,7 @@ pub(crate) fn bars(title: &str, unit: &str, rows: &[(String, f64, Option<f64>)])
             bar(*upper, "bar light", 8.0);
         }
         bar(*value, "bar", 16.0);
-        let text = upper.map_or(number(*value), |u| format!("{}, p99 {}", number(*value), number(u)));
+        let text = words(row);
         let end = at(upper.unwrap_or(*value).max(*value).max(0.0));
         let _ = write!(out, "<text class=\"label\" x=\"{:.1}\" y=\"{}\">{text}</text>", end + 5.0, y + 13.0);
     }

@@ -160,10 +160,11 @@ pub struct EffectsReport {
     pub runs: Vec<Run>,
 }
 
-/// A small made head, pressed ever again: small pictures, so that what an effect adds to a frame is seen beside it.
+/// A small made head, pressed deeper from the beginning of a run to its end, so that tissue gives way in every part of it, with and without what lets it
+/// come back; small pictures, so that what an effect adds to a frame is seen beside it.
 const BASE: &str = r#"
 name = "effects"
-description = "a small made head, pressed at the cheek"
+description = "a small made head, pressed ever deeper at the cheek"
 [volume]
 phantom = "head"
 size = 96
@@ -172,8 +173,8 @@ radius_mm = 3.0
 [tool.approach]
 from = [0.81, 0.07, 0.317]
 toward = [0.68, 0.275, 0.317]
-press_mm = 6.0
-period_s = 1.5
+press_mm = 10.0
+hover_mm = 0.5
 [rendering]
 size = [320, 240]
 section_size = [160, 120]
@@ -248,6 +249,12 @@ fn base(options: &EffectsOptions) -> Result<Scene, TradeoffError> {
         Some(path) => Scene::open(Some(path), None).map_err(wrong)?,
         None => Scene::parse("the base scene", BASE).map_err(wrong)?,
     };
+    if options.scene.is_none()
+        && let Some(approach) = scene.tool.as_mut().and_then(|t| t.approach.as_mut())
+    {
+        // an approach is at its deepest after 0.35 of its period
+        approach.period_s = options.duration.as_secs_f64() / 0.35;
+    }
     if let Some(volume) = &options.volume {
         if !volume.exists() {
             return Err(TradeoffError::Run(format!("there is no volume {}", volume.display())));

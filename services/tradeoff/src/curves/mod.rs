@@ -5,16 +5,28 @@ mod contact;
 mod displacement;
 mod mapper;
 mod motion;
+mod needle;
 mod raycast;
+mod vif;
 mod warp;
 
 use crate::curve::Curve;
 
 /// Every curve there is, in the order of the report.
 pub fn all() -> impl Iterator<Item = &'static Curve> {
-    [chainmail::CURVES, mapper::CURVES, displacement::CURVES, motion::CURVES, raycast::CURVES, warp::CURVES, contact::CURVES]
-        .into_iter()
-        .flatten()
+    [
+        chainmail::CURVES,
+        mapper::CURVES,
+        displacement::CURVES,
+        motion::CURVES,
+        raycast::CURVES,
+        warp::CURVES,
+        vif::CURVES,
+        contact::CURVES,
+        needle::CURVES,
+    ]
+    .into_iter()
+    .flatten()
 }
 
 /// Mean and largest of errors.
