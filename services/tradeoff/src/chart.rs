@@ -167,8 +167,10 @@ pub(crate) fn scatter(subject: &MeasuredSubject, unit: &str) -> String {
         if let Some(choice) = choices.into_iter().find(|c| free(&area(*c))) {
             let a = area(choice);
             taken.push(a);
+            // where lines cross, a name has its line's colour
+            let tint = if lines.len() > 1 { format!(" t{}", colour(p.line)) } else { String::new() };
             let class = if p.accuracy.is_empty() { "label" } else { "label marked" };
-            let _ = write!(out, "<text class=\"{class}\" x=\"{:.1}\" y=\"{:.1}\">{}</text>", a[0], a[3] - 2.0, escaped(&text));
+            let _ = write!(out, "<text class=\"{class}{tint}\" x=\"{:.1}\" y=\"{:.1}\">{}</text>", a[0], a[3] - 2.0, escaped(&text));
         }
     }
     out + "</svg>"

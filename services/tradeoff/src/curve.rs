@@ -149,7 +149,9 @@ pub fn number(value: f64) -> String {
         return value.to_string();
     }
     if !(1e-4..1e6).contains(&size) {
-        return format!("{value:.2e}");
+        let text = format!("{value:.2e}");
+        let (figures, power) = text.split_once('e').unwrap_or((&text, "0"));
+        return format!("{}e{power}", figures.trim_end_matches('0').trim_end_matches('.'));
     }
     let digits = (2 - size.log10().floor() as i32).max(0) as usize;
     let text = format!("{value:.digits$}");
@@ -162,9 +164,17 @@ mod tests {
 
     #[test]
     fn numbers_are_written_with_three_figures() {
-        for (value, text) in
-            [(0.0, "0"), (1.0, "1"), (0.05, "0.05"), (12.345, "12.3"), (0.000_123_4, "0.000123"), (1234.5, "1234"), (99.96, "100")]
-        {
+        for (value, text) in [
+            (0.0, "0"),
+            (1.0, "1"),
+            (0.05, "0.05"),
+            (12.345, "12.3"),
+            (0.000_123_4, "0.000123"),
+            (1234.5, "1234"),
+            (99.96, "100"),
+            (3e-5, "3e-5"),
+            (1.25e-7, "1.25e-7"),
+        ] {
             assert_eq!(number(value), text);
         }
     }

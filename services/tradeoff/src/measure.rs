@@ -91,7 +91,7 @@ pub struct MeasuredSubject {
 
 /// Times a subject's settings and judges them. Give it the pool of one thread that the work shall run on.
 pub fn measure(curve: &Curve, mut subject: Subject, effort: Effort) -> MeasuredSubject {
-    let budget = effort.pick(Duration::from_millis(700), Duration::from_secs(6));
+    let budget = effort.pick(Duration::from_millis(700), Duration::from_secs(4));
     let (least, most) = effort.pick((3, 41), (7, 201));
     let count = subject.settings.len();
     let mut times = vec![Vec::new(); count];
