@@ -21,10 +21,10 @@ use std::{f64::consts::TAU, path::Path, sync::Arc};
 
 pub(super) static CURVES: &[Curve] = &[
     Curve {
-        name: "motion.resolution",
+        name: "breathing.field_spacing_mm",
         engine: "motion",
-        knob: KnobOf::Engine(None),
-        title: "nodes of the displacement fields along an edge of 320 mm",
+        knob: KnobOf::Registry("breathing.field_spacing_mm"),
+        title: "distance of the nodes of the displacement fields",
         error: "mean distance of u between the nodes from the true one",
         unit: "mm",
         truth: "the displacement by formula",
@@ -33,10 +33,10 @@ pub(super) static CURVES: &[Curve] = &[
         bench: resolution,
     },
     Curve {
-        name: "motion.precision",
+        name: "breathing.precision_bits",
         engine: "motion",
-        knob: KnobOf::Engine(None),
-        title: "how a node is stored: 16 bits of floating point, 16 bits of a step, 32 bits",
+        knob: KnobOf::Registry("breathing.precision_bits"),
+        title: "bits of a component of a stored vector: 16 in steps of one size, 32 single precision; and half floats",
         error: "mean distance of u at the nodes from what was stored",
         unit: "mm",
         truth: "the fields as given",
@@ -47,6 +47,20 @@ pub(super) static CURVES: &[Curve] = &[
              apart costs more than reading half as much saves",
         ),
         bench: precision,
+    },
+    Curve {
+        name: "breathing.inversion_tolerance_mm",
+        engine: "motion",
+        knob: KnobOf::Registry("breathing.inversion_tolerance_mm"),
+        title: "residual at which a tick's inversion stops",
+        error: "mean distance of the reference position found from the one that was moved, begun a tenth of a millimetre off",
+        unit: "mm",
+        truth: "reference positions moved by the model",
+        timed: "a tick's inverse, warm, signal and coefficients included (mean of 2 000)",
+        theory: Theory::Not(
+            "Newton's method gains most of its digits in the last iteration: a tolerance that it already met costs nothing more and gives nothing",
+        ),
+        bench: tolerance,
     },
     Curve {
         name: "motion.model",
@@ -77,8 +91,9 @@ pub(super) static CURVES: &[Curve] = &[
     },
 ];
 
-/// Edge of the box [mm].
+/// Edge of the box [mm], and of the part of it that the quick report looks at.
 const EDGE_MM: f64 = 320.0;
+const QUICK_EDGE_MM: f64 = 120.0;
 
 fn patient_grid(nodes: usize) -> Grid {
     Grid::axis_aligned([nodes; 3], [EDGE_MM / (nodes - 1) as f64; 3])
@@ -127,8 +142,12 @@ fn fail(e: impl std::fmt::Display) -> TradeoffError {
 }
 
 fn surrogate(nodes: usize, precision: Precision) -> Result<MotionModel<'static>, TradeoffError> {
+    surrogate_on(&patient_grid(nodes), precision)
+}
+
+fn surrogate_on(grid: &Grid, precision: Precision) -> Result<MotionModel<'static>, TradeoffError> {
     // without the curved part, so that the model is exact and what remains is what is asked about
-    let bases = bases(&patient_grid(nodes));
+    let bases = bases(grid);
     let signals: Vec<Vec<f64>> = (0..6).map(|j| signal(f64::from(j) / 6.0, 1.0).to_vec()).collect();
     let fields: Vec<VectorField> = signals.iter().map(|z| field(&bases, [z[0], z[1], 0.0])).collect();
     fit_surrogate(&fields, &signals, [0.0, 1.0], precision).map_err(fail)
@@ -140,13 +159,14 @@ fn places(count: u32, edge: f64) -> impl Iterator<Item = [f64; 3]> {
 }
 
 fn resolution(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
-    let counts: &[usize] = context.effort.pick(&[8, 12, 16, 24, 32, 48], &[16, 24, 32, 48, 64, 96, 128]);
+    let edge = context.effort.pick(QUICK_EDGE_MM, EDGE_MM);
     let [g, r] = signal(0.1, 1.0);
     let mut settings = Vec::new();
-    for &nodes in counts {
-        let model = surrogate(nodes, Precision::I16)?;
+    for spacing in [20.0, 12.0, 8.0, 5.0, 4.0, 2.5] {
+        let nodes = (edge / spacing).ceil() as usize + 1;
+        let model = surrogate_on(&Grid::axis_aligned([nodes; 3], [spacing; 3]), Precision::I16)?;
         let at = MotionAt::new(&model, model.kind().weights_of(&[g, r]));
-        let errors = mean_and_worst(places(4000, EDGE_MM).map(|x| distance(at.displacement_mm(x), truth(x, [g, r, 0.0]))));
+        let errors = mean_and_worst(places(4000, edge).map(|x| distance(at.displacement_mm(x), truth(x, [g, r, 0.0]))));
         let (mut collapsed, mut frame) = (Collapsed::new(&model, 0.05), 0u32);
         let run = move || {
             frame += 1;
@@ -154,13 +174,23 @@ fn resolution(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
             let weights = model.kind().weights_of(&[g, r]);
             spent(|| collapsed.update(&model, &weights).unsettled)
         };
-        settings.push(Setting::new("", nodes as f64, errors, run).called(format!("{nodes}³")));
+        settings.push(Setting::new("", spacing, errors, run).called(format!("{spacing} mm ({nodes}³)")));
     }
-    Ok(vec![Subject { name: "made breathing in a box of 320 mm".into(), settings }])
+    Ok(vec![Subject { name: format!("made breathing in a box of {edge} mm"), settings }])
 }
 
 /// A hand that moves a millimetre in a few ticks, while the patient breathes: each tick's inverse begins at the last one's answer.
 fn ticks(model: MotionModel<'static>, weights: impl Fn(f64) -> Weights + Send + 'static, edge: f64) -> impl FnMut() -> f64 + Send {
+    ticks_to(1e-3, model, weights, edge)
+}
+
+/// The same to a tolerance of the inverse [mm].
+fn ticks_to(
+    tolerance_mm: f64,
+    model: MotionModel<'static>,
+    weights: impl Fn(f64) -> Weights + Send + 'static,
+    edge: f64,
+) -> impl FnMut() -> f64 + Send {
     const TICKS: u32 = 2000;
     let mut rounds = 0.0;
     move || {
@@ -170,7 +200,8 @@ fn ticks(model: MotionModel<'static>, weights: impl Fn(f64) -> Weights + Send + 
             for tick in 0..TICKS {
                 let t = f64::from(tick) * 1e-3;
                 let hand = [0.5 + 0.12 * (3.0 * t).sin(), 0.47 + 0.1 * (4.0 * t).cos(), 0.5 + 0.02 * t].map(|s| s * edge);
-                guess = MotionAt::new(&model, weights(0.25 * (t + rounds))).to_reference(hand, guess).reference;
+                let at = MotionAt::new(&model, weights(0.25 * (t + rounds))).tolerance_mm(tolerance_mm);
+                guess = at.to_reference(hand, guess).reference;
             }
             guess
         }) / f64::from(TICKS)
@@ -184,7 +215,9 @@ fn precision(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
     let [g, r] = signal(0.1, 1.0);
     let stored = field(&exact, [g, r, 0.0]);
     let mut settings = Vec::new();
-    for (value, precision, word) in [(1.0, Precision::F16, "f16"), (2.0, Precision::I16, "i16"), (3.0, Precision::F32, "f32")] {
+    for (line, value, precision, word) in
+        [("", 16.0, Precision::I16, "16"), ("", 32.0, Precision::F32, "32"), ("half floats", 16.0, Precision::F16, "f16")]
+    {
         let model = surrogate(nodes, precision)?;
         let at = MotionAt::new(&model, model.kind().weights_of(&[g, r]));
         let errors = mean_and_worst((0..4000usize).map(|n| {
@@ -195,7 +228,25 @@ fn precision(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
         let label = format!("{word}, {:.1} MiB", model.size_bytes() as f64 / f64::from(1 << 20));
         let kind = model.kind().clone();
         let run = ticks(model, move |phase| kind.weights_of(&signal(phase, 1.0)), EDGE_MM);
-        settings.push(Setting { value: Some(value), ..Setting::new("", value, errors, run).called(label) });
+        settings.push(Setting::new(line, value, errors, run).called(label));
+    }
+    Ok(vec![Subject { name: format!("two fields of {nodes}³ nodes"), settings }])
+}
+
+fn tolerance(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
+    let nodes = context.effort.pick(48, 96);
+    let mut settings = Vec::new();
+    for tolerance_mm in [0.1, 0.03, 0.01, 0.003, 0.001, 0.0005, 0.0002] {
+        let model = surrogate(nodes, Precision::F32)?;
+        let at = MotionAt::new(&model, model.kind().weights_of(&signal(0.1, 1.0))).tolerance_mm(tolerance_mm);
+        let errors = mean_and_worst(places(2000, EDGE_MM).map(|x| {
+            // as warm as a hand that moves a tenth of a millimetre a tick
+            let guess = [x[0] + 0.06, x[1] - 0.06, x[2] + 0.06];
+            distance(at.to_reference(at.to_world(x), guess).reference, x)
+        }));
+        let kind = model.kind().clone();
+        let run = ticks_to(tolerance_mm, model, move |phase| kind.weights_of(&signal(phase, 1.0)), EDGE_MM);
+        settings.push(Setting::new("", tolerance_mm, errors, run));
     }
     Ok(vec![Subject { name: format!("two fields of {nodes}³ nodes"), settings }])
 }
