@@ -9,7 +9,7 @@ use std::{io::Write as _, path::PathBuf, time::Duration};
 
 /// Measure what each effect costs: a base scene run with it and without it
 ///
-/// The base scene (a small made head, or SCENE) runs headless with each effect of the registry alone, each together with what it depends on,
+/// The base scene (a small made torso, or SCENE) runs headless with each effect of the registry alone, each together with what it depends on,
 /// and with all of them; printed is what each adds to a tick, a step and a frame (p50, p99), to shared and private memory, and which
 /// processes it brings. Nothing else should run meanwhile: what does is part of the figures.
 ///

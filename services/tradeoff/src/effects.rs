@@ -31,7 +31,7 @@ use std::{
 pub struct EffectsOptions {
     /// this program
     pub program: PathBuf,
-    /// base scene; none: a small made head
+    /// base scene; none: a small made torso
     pub scene: Option<PathBuf>,
     /// another volume in it
     pub volume: Option<PathBuf>,
@@ -160,27 +160,29 @@ pub struct EffectsReport {
     pub runs: Vec<Run>,
 }
 
-/// A small made head, pressed deeper from the beginning of a run to its end, so that tissue gives way in every part of it, with and without what lets it
+/// A small made torso, since it can breathe and a made head cannot, pressed deeper from the beginning of a run to its end, so that tissue gives way in every part of it, with and without what lets it
 /// come back; small pictures, so that what an effect adds to a frame is seen beside it.
 const BASE: &str = r#"
 name = "effects"
-description = "a small made head, pressed ever deeper at the cheek"
+description = "a small made torso, pressed ever deeper at the belly"
 [volume]
-phantom = "head"
+phantom = "torso"
 size = 96
 [tool]
-radius_mm = 3.0
+radius_mm = 6.0
 [tool.approach]
-from = [0.81, 0.07, 0.317]
-toward = [0.68, 0.275, 0.317]
-press_mm = 10.0
+from = [0.55, 0.0, 0.2]
+toward = [0.55, 0.6, 0.2]
+press_mm = 15.0
 hover_mm = 0.5
 [rendering]
 size = [320, 240]
 section_size = [160, 120]
 transfer = "skin"
-from = [0.75, -1.0, 0.0]
-distance = 0.7
+from = [0.5, -1.0, 0.2]
+[deformation]
+offset = 0.3
+movement_limit_mm = 30.0
 "#;
 
 /// Gives an effect something to do: what it needs of the scene beyond its name.

@@ -49,6 +49,13 @@ impl FrameBudget {
         Self { frame_ms: frame_ms.max(1e-3), full_ms: None, last: Quality::FULL, rested: 0 }
     }
 
+    /// Changes the time that there is for a frame [ms]: what everything else leaves.
+    pub fn allow(&mut self, frame_ms: f64) {
+        if frame_ms.is_finite() {
+            self.frame_ms = frame_ms.max(1e-3);
+        }
+    }
+
     /// Says what the last frame, drawn with the quality given out last, took [ms]; numbers that are no times are ignored.
     pub fn drawn(&mut self, ms: f64) {
         if !(ms.is_finite() && ms > 0.0) {

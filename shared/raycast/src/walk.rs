@@ -373,7 +373,7 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
 
     /// Walks to the end.
     #[inline(always)]
-    fn walk(mut self) -> Packet {
+    fn walk(&mut self) -> Packet {
         let (l, frame, adaptive) = (self.l, self.frame, self.frame.adaptive);
         let (distances, counts) = self.stage.skip.distances();
         let large = distances.len() > EXACT;
@@ -571,7 +571,7 @@ fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::
     let mut gap = l.set(0.0);
     for (c, &p) in p.iter().enumerate() {
         let beyond = (l.set(0.0) - p).max(p - l.set(frame.last[c]));
-        gap = gap.max(beyond / bend.speed()[c]);
+        gap = gap.max(beyond * bend.slowest()[c]);
     }
     (l.set(0.0).lt(gap), gap)
 }
@@ -612,5 +612,6 @@ pub fn cast<L: Lanes, S: BrickSource + ?Sized>(
     let rays = Rays::new(l, frame, ends, x, y);
     let bend = tile.map(|tile| Bend::new(l, frame, tile, [x, y], rays.start, rays.delta));
     let inverse = axes!(c => l.set(1.0) / rays.delta[c]);
-    Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] }.walk()
+    let mut walker = Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] };
+    walker.walk()
 }

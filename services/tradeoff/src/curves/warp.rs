@@ -2,9 +2,9 @@
 //!
 //! The field is one wave of shear, whose inverse is known by formula, given to the ray caster on 96³ nodes (which is itself wrong by at most
 //! 0.007 mm). Of the lattice the error is the distance of the rest positions that rays are sent to from the true ones, and `largest` the bound that the
-//! ray caster itself computes for the patient's lattice. Of the picture's own lattice it is what that does to the picture.
+//! ray caster itself computes for the frame.
 
-use super::{distance, mean_and_worst, raycast::difference};
+use super::{distance, mean_and_worst};
 use crate::{
     TradeoffError,
     clock::spent,
@@ -22,7 +22,7 @@ pub(super) static CURVES: &[Curve] = &[
         engine: "raycast",
         knob: KnobOf::Engine(None),
         title: "distance of the nodes of the lattice on which the field is inverted for a frame",
-        error: "mean distance of rest positions from the true ones (largest: the patient's lattice's own bound)",
+        error: "mean distance of rest positions from the true ones (largest: the frame's own bound)",
         unit: "mm",
         truth: "the inverse by formula of a wave of shear",
         timed: "the frame's inverse, and the frame",
@@ -32,41 +32,25 @@ pub(super) static CURVES: &[Curve] = &[
         ),
         bench: |c| {
             let one = |pitch_mm| WarpOptions { tolerance_mm: 0.05, pitch_mm };
-            bench(c, Error::Position, &[24.0, 16.0, 8.0, 4.0, 2.0].map(|p: f32| (p, one(p))))
+            bench(c, Pitch::Given, &[24.0, 16.0, 8.0, 4.0, 2.0].map(|p: f32| (p, one(p))))
         },
     },
     Curve {
         name: "breathing.picture_tolerance_mm",
         engine: "raycast",
         knob: KnobOf::Registry("breathing.picture_tolerance_mm"),
-        title: "how far from its place a picture may show anything: sets the pitch of the patient's lattice and of the picture's own",
-        error: "mean distance of rest positions from the true ones (largest: the patient's lattice's own bound)",
+        title: "how far from its place a picture may show anything: sets the lattice's pitch and the bends of rays",
+        error: "mean distance of rest positions from the true ones (largest: the frame's own bound)",
         unit: "mm",
         truth: "the inverse by formula of a wave of shear",
         timed: "the frame's inverse, and the frame",
         theory: Theory::Not(
-            "the lattice is made finer until the frame's bound is within the tolerance: tolerances that one pitch serves differ in the picture's own lattice only, and \
+            "the lattice is made finer until the frame's bound is within the tolerance: tolerances that one pitch serves differ in their rays only, and \
              the given field itself is wrong by up to 0.007 mm",
         ),
         bench: |c| {
-            // as the rendering service has it
-            let one = |tolerance_mm: f32| WarpOptions { tolerance_mm: 0.66 * tolerance_mm, ..WarpOptions::default() };
-            bench(c, Error::Bounded, &[1.0, 0.3, 0.1, 0.03, 0.01].map(|t: f32| (t, one(t))))
-        },
-    },
-    Curve {
-        name: "warp.picture_lattice",
-        engine: "raycast",
-        knob: KnobOf::Engine(None),
-        title: "error allowed between the nodes of a picture's own lattice, which follows its rays",
-        error: "difference of the picture, root mean square over all channels of all pixels, per cent of full scale",
-        unit: "%",
-        truth: "the same frame within four micrometres",
-        timed: "the frame's inverse, and the frame",
-        theory: Theory::Monotone,
-        bench: |c| {
-            let one = |tolerance_mm| WarpOptions { tolerance_mm, ..WarpOptions::default() };
-            bench(c, Error::Picture, &[0.8, 0.4, 0.2, 0.1, 0.05, 0.02].map(|t: f32| (t, one(t))))
+            let one = |tolerance_mm: f32| WarpOptions { tolerance_mm, ..WarpOptions::default() };
+            bench(c, Pitch::Sought, &[1.0, 0.3, 0.1, 0.03, 0.01].map(|t: f32| (t, one(t))))
         },
     },
 ];
@@ -74,18 +58,16 @@ pub(super) static CURVES: &[Curve] = &[
 /// Pitches tried for a tolerance [mm], coarse to fine.
 const PITCHES: [f32; 5] = [16.0, 8.0, 6.0, 4.0, 2.0];
 
-/// What is compared with what.
+/// Where the lattice's pitch comes from.
 #[derive(Clone, Copy, PartialEq)]
-enum Error {
-    /// rest positions with the formula's
-    Position,
-    /// the same, on a lattice as coarse as the setting's tolerance allows
-    Bounded,
-    /// the picture with one whose rays have knots everywhere
-    Picture,
+enum Pitch {
+    /// as the setting says
+    Given,
+    /// as coarse as the setting's tolerance allows
+    Sought,
 }
 
-fn bench(context: &Context, error: Error, options: &[(f32, WarpOptions)]) -> Result<Vec<Subject>, TradeoffError> {
+fn bench(context: &Context, pitch: Pitch, options: &[(f32, WarpOptions)]) -> Result<Vec<Subject>, TradeoffError> {
     let fail = |e: &dyn std::fmt::Display| TradeoffError::Bench("raycast", e.to_string());
     let patient = context.patients.made(Kind::Head, context.effort);
     let volume = Arc::clone(&patient.volume);
@@ -100,20 +82,11 @@ fn bench(context: &Context, error: Error, options: &[(f32, WarpOptions)]) -> Res
     let camera = Camera::around(volume.info());
     let [width, height] = context.effort.pick([160, 128], [612, 507]);
     let mut out = Vec::new();
-    let draw = |options: WarpOptions| -> Result<Picture, TradeoffError> {
-        let mut warp = Warp::new(volume.info(), options);
-        warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
-        let mut picture = Picture::new(width, height);
-        let extras = Extras { warp: Some(&warp), ..Extras::default() };
-        render_extra(&extras, &*volume, &skip, &camera, &settings, &mut picture).map_err(|e| fail(&e))?;
-        Ok(picture)
-    };
-    let truth = draw(WarpOptions { tolerance_mm: 0.004, pitch_mm: 4.0 })?;
     for &(value, options) in options {
         let mut options = options;
         let mut warp = Warp::new(volume.info(), options);
         let mut report = warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
-        if error == Error::Bounded {
+        if pitch == Pitch::Sought {
             for pitch_mm in PITCHES {
                 options.pitch_mm = pitch_mm;
                 warp = Warp::new(volume.info(), options);
@@ -142,10 +115,7 @@ fn bench(context: &Context, error: Error, options: &[(f32, WarpOptions)]) -> Res
                 updated && render_extra(&extras, &*volume, &skip, &camera, &settings, &mut picture).is_ok()
             })
         };
-        let errors = match error {
-            Error::Position | Error::Bounded => [errors[0], f64::from(report.error_mm)],
-            Error::Picture => difference(&draw(options)?, &truth),
-        };
+        let errors = [errors[0], f64::from(report.error_mm)];
         // the number as it is written, not its nearest f32
         let written = value.to_string();
         out.push(Setting::new("", written.parse().unwrap_or(f64::from(value)), errors, run).called(written));

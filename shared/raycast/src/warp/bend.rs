@@ -19,29 +19,42 @@ use wide::f32x4;
 /// Parabolas are continued a little before their slab, where a hit is refined.
 const BEFORE: f32 = -0.3;
 
+/// A slab as all lanes of a packet would have it: lanes come into it one after the other.
+struct Slab<L: Lanes> {
+    number: i32,
+    /// a, b, c
+    parabola: [[L::Float; 3]; 3],
+    /// slab that `turns` is of
+    turned: f32,
+    /// see [`Tile::turns`]
+    turns: [[f32x4; 3]; 2],
+}
+
 /// Parabolas of every lane.
 pub(crate) struct Bend<'t, 'v, L: Lanes> {
     tile: &'t mut Tile<'v>,
     pixel: [usize; 2],
     /// slabs a step, and slab coordinate at q = 0
     rate: L::Float,
+    /// its inverse
+    steps: L::Float,
     base: L::Float,
     delta: [L::Float; 3],
     /// slab of each lane
     slab: L::Float,
-    a: [L::Float; 3],
-    b: [L::Float; 3],
-    c: [L::Float; 3],
+    parabola: [[L::Float; 3]; 3],
+    /// the last even and the last odd slab
+    slabs: [Slab<L>; 2],
     /// s of the last samples
     local: L::Float,
     /// slab that `turn` is of
     turned: L::Float,
     /// ∂v_c/∂x_d at row 3 d + c, and its change over the slab
     turn: [[L::Float; 9]; 2],
-    /// no axis moves faster than this [index per step]
-    speed: [L::Float; 3],
-    /// largest bending of rays [index per step²]
-    bending: f32,
+    /// steps that an index takes at least, along each axis
+    slowest: [L::Float; 3],
+    /// steps after which bending may have used up a cell
+    straight: f32,
 }
 
 impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
@@ -51,28 +64,29 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
         let view = tile.view;
         let rate = frame.step / view.apart;
         let zero = l.set(0.0);
+        let slab = |zero| Slab { number: -1, parabola: [[zero; 3]; 3], turned: -1.0, turns: [[f32x4::ZERO; 3]; 2] };
         Self {
             pixel,
             rate: l.set(rate),
+            steps: l.set(1.0 / rate),
             base: (start - l.set(view.first)) * l.set(1.0 / view.apart),
             delta,
             slab: l.set(-1e9),
-            a: [zero; 3],
-            b: [zero; 3],
-            c: [zero; 3],
+            parabola: [[zero; 3]; 3],
+            slabs: [slab(zero), slab(zero)],
             local: zero,
             turned: l.set(-1e9),
             turn: [[zero; 9]; 2],
-            speed: axes!(d => delta[d].abs() + l.set(view.steepest[d] * frame.step)),
-            bending: view.bending * frame.step * frame.step,
+            slowest: axes!(d => l.set(1.0) / (delta[d].abs() + l.set(view.steepest[d] * frame.step))),
+            straight: (2.0 * CELL as f32 / (view.bending * frame.step * frame.step)).sqrt(),
             tile,
         }
     }
 
-    /// Bound on the speed in rest space [index per step].
+    /// Steps that an index in rest space takes at least, along each axis.
     #[inline(always)]
-    pub fn speed(&self) -> &[L::Float; 3] {
-        &self.speed
+    pub fn slowest(&self) -> &[L::Float; 3] {
+        &self.slowest
     }
 
     /// Rest positions of samples at q, whose world positions are p.
@@ -86,7 +100,8 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
             local = s - self.slab;
         }
         self.local = local;
-        axes!(d => p[d] + local.fma(local.fma(self.c[d], self.b[d]), self.a[d]))
+        let [a, b, c] = &self.parabola;
+        axes!(d => p[d] + local.fma(local.fma(c[d], b[d]), a[d]))
     }
 
     /// Reads the slabs into which lanes have come.
@@ -98,27 +113,39 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
         while left.any() {
             let number = each[left.bits().trailing_zeros() as usize];
             let here = left & numbers.eq(l.int(number));
-            self.tile.fill(number as usize);
-            let (corner, place, width) = self.tile.corners(number as usize, self.pixel);
-            let across = l.load(&std::array::from_fn(|n| place[0] + (n % L::ACROSS) as f32 * width));
-            let down = l.load(&std::array::from_fn(|n| place[1] + (n / L::ACROSS) as f32 * width));
-            self.slab = self.slab.or(here, l.set(number as f32));
-            macro_rules! read {
-                ($field:ident, $m:expr) => {
-                    let [p, q, r, t] = [corner[0][$m], corner[1][$m], corner[2][$m], corner[3][$m]];
-                    let (x, y, both): ([f32; 4], [f32; 4], [f32; 4]) = ((q - p).to_array(), (r - p).to_array(), (t - q - r + p).to_array());
-                    let p = p.to_array();
-                    for d in 0..3 {
-                        let first = across.fma(l.set(x[d]), l.set(p[d]));
-                        let slope = across.fma(l.set(both[d]), l.set(y[d]));
-                        self.$field[d] = self.$field[d].or(here, down.fma(slope, first));
-                    }
-                };
+            let parity = number as usize & 1;
+            if self.slabs[parity].number != number {
+                self.read(l, number);
             }
-            read!(a, 0);
-            read!(b, 1);
-            read!(c, 2);
+            self.slab = self.slab.or(here, l.set(number as f32));
+            let from = &self.slabs[parity].parabola;
+            for m in 0..3 {
+                for d in 0..3 {
+                    self.parabola[m][d] = self.parabola[m][d].or(here, from[m][d]);
+                }
+            }
             left = left & !here;
+        }
+    }
+
+    /// Parabolas of all lanes in a slab.
+    #[inline(always)]
+    fn read(&mut self, l: L, number: i32) {
+        self.tile.fill(number as usize);
+        let (corner, place, width) = self.tile.corners(number as usize, self.pixel);
+        let across = l.load(&std::array::from_fn(|n| place[0] + (n % L::ACROSS) as f32 * width));
+        let down = l.load(&std::array::from_fn(|n| place[1] + (n / L::ACROSS) as f32 * width));
+        let slab = &mut self.slabs[number as usize & 1];
+        slab.number = number;
+        for (m, out) in slab.parabola.iter_mut().enumerate() {
+            let [p, q, r, t] = [corner[0][m], corner[1][m], corner[2][m], corner[3][m]];
+            let (x, y, both): ([f32; 4], [f32; 4], [f32; 4]) = ((q - p).to_array(), (r - p).to_array(), (t - q - r + p).to_array());
+            let p = p.to_array();
+            for d in 0..3 {
+                let first = across.fma(l.set(x[d]), l.set(p[d]));
+                let slope = across.fma(l.set(both[d]), l.set(y[d]));
+                out[d] = down.fma(slope, first);
+            }
         }
     }
 
@@ -130,16 +157,17 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
         // a third of the cells is left to bending
         let spare = (d * l.set(0.34)).whole().float();
         let (mut within, mut beyond) = (l.set(f32::INFINITY), l.set(f32::INFINITY));
+        let [_, b, c] = &self.parabola;
         for n in 0..3 {
-            let slope = (self.local + self.local).fma(self.c[n], self.b[n]);
+            let slope = (self.local + self.local).fma(c[n], b[n]);
             let speed = slope.fma(self.rate, self.delta[n]);
-            let at_end = (rest + rest).fma(self.c[n] * self.rate, speed);
+            let at_end = (rest + rest).fma(c[n] * self.rate, speed);
             let speed = speed.or(speed.abs().lt(l.set(TINY)), l.set(TINY));
             let inverse = l.set(1.0) / speed;
             let (low, high) = ((corner[n] + l.set(1.0) - d) * l.set(CELL as f32), (corner[n] + d) * l.set(CELL as f32));
             let wall = low.or(zero.lt(speed), high);
             let way = (wall - p[n]) * inverse;
-            let off = self.c[n].abs();
+            let off = c[n].abs();
             // a ray that turns round within the slab goes |c| at most either way
             let turns = (speed * at_end).lt(zero);
             let room = (p[n] - low).min(high - p[n]);
@@ -147,9 +175,9 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
             within = within.min((way - off * inverse.abs()).max(zero).or(turns, turned));
             beyond = beyond.min(way - spare * l.set(CELL as f32) * inverse.abs());
         }
-        // ½ bending · length² = spare cells
-        let reach = (spare * l.set(2.0 * CELL as f32 / self.bending)).sqrt();
-        within.min(rest / self.rate).max(beyond.min(reach))
+        // ½ bending · length² is at most the spare cells: the root of 1 … 5, from below
+        let root = (spare - l.set(1.0)).fma(l.set(0.309), l.set(1.0)).only(zero.lt(spare));
+        within.min(rest * self.steps).max(beyond.min(root * l.set(self.straight)))
     }
 
     /// A gradient of rest space [per mm along the grid's axes], as world space sees it.
@@ -163,9 +191,13 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
                 let number = each[other.bits().trailing_zeros() as usize].max(0.0);
                 let wanted = l.set(number);
                 let here = other & !(self.slab.lt(wanted) | wanted.lt(self.slab));
-                let middle = [self.pixel[0] as f32 + 0.5 * (L::ACROSS as f32 - 1.0), self.pixel[1] as f32 + 0.5 * (L::DOWN as f32 - 1.0)];
-                let turns: [[f32x4; 3]; 2] = self.tile.turns(number as usize, middle);
-                for (rows, turns) in self.turn.iter_mut().zip(turns) {
+                let slab = &mut self.slabs[number as usize & 1];
+                if slab.turned != number {
+                    let middle =
+                        [self.pixel[0] as f32 + 0.5 * (L::ACROSS as f32 - 1.0), self.pixel[1] as f32 + 0.5 * (L::DOWN as f32 - 1.0)];
+                    (slab.turned, slab.turns) = (number, self.tile.turns(number as usize, middle));
+                }
+                for (rows, turns) in self.turn.iter_mut().zip(slab.turns) {
                     for (d, turn) in turns.into_iter().enumerate() {
                         let t = turn.to_array();
                         for c in 0..3 {

@@ -106,10 +106,15 @@ impl<'a> Tile<'a> {
     }
 
     /// Makes the parabolas of a slab, if they are not there.
+    #[inline(always)]
     pub fn fill(&mut self, slab: usize) {
-        if self.filled[slab] == self.number {
-            return;
+        if self.filled[slab] != self.number {
+            self.make(slab);
         }
+    }
+
+    #[inline(never)]
+    fn make(&mut self, slab: usize) {
         self.filled[slab] = self.number;
         (slab..slab + 4).for_each(|k| self.plane(k));
         for n in 0..self.counts[0] * self.counts[1] {
@@ -121,6 +126,7 @@ impl<'a> Tile<'a> {
     }
 
     /// The four nodes around a packet, in a slab that is there, and where the packet's first pixel is among them [nodes], and a pixel's width.
+    #[inline(always)]
     pub fn corners(&self, slab: usize, pixel: [usize; 2]) -> ([[f32x4; 3]; 4], [f32; 2], f32) {
         let cell = [0, 1].map(|c| ((pixel[c] - self.first[c]) / self.fine).min(self.counts[c] - 2));
         let at = slab * self.room + cell[1] * self.counts[0] + cell[0];
@@ -131,6 +137,7 @@ impl<'a> Tile<'a> {
     }
 
     /// ∂v/∂x [mm per mm] at a pixel at the beginning of a slab, and its change to the end: for each axis d, by component.
+    #[inline(always)]
     pub fn turns(&self, slab: usize, pixel: [f32; 2]) -> [[f32x4; 3]; 2] {
         let [nx, ny, _] = self.view.counts;
         let (mut cell, mut t) = ([0; 2], [f32x4::ZERO; 2]);
