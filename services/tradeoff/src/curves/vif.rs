@@ -24,8 +24,8 @@ pub(super) static CURVES: &[Curve] = &[
         truth: "the voxels",
         timed: "building the octree",
         theory: Theory::Not(
-            "every node is fitted in one pass whatever ε₀ is, so that the time is nearly the same; what a finer ε₀ costs is size (in the label: \
-             voxels' bytes over the octree's), and only the writing of more leaves takes time",
+            "every node is fitted in one pass whatever ε₀ is, so that the time is nearly the same; what a finer ε₀ costs is size (in the label, as a share of the \
+             voxels' bytes), and only the writing of more leaves takes time",
         ),
         bench: octrees,
     },
@@ -57,7 +57,7 @@ fn octrees(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
             let measured = octree.measure(&*patient.volume);
             let volume = Arc::clone(&patient.volume);
             let run = move || spent(|| Octree::build(&*volume, options).is_ok());
-            let label = format!("{hu} HU ({:.1}:1)", octree.size().ratio());
+            let label = format!("{hu} HU ({:.0} % of the voxels)", 100.0 * octree.size().ratio());
             settings.push(Setting::new("", hu, [measured.rms, measured.largest], run).called(label));
         }
         subjects.push(Subject { name: patient.name, settings });

@@ -119,10 +119,8 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
             }
             self.slab = self.slab.or(here, l.set(number as f32));
             let from = &self.slabs[parity].parabola;
-            for m in 0..3 {
-                for d in 0..3 {
-                    self.parabola[m][d] = self.parabola[m][d].or(here, from[m][d]);
-                }
+            for (own, from) in self.parabola.iter_mut().flatten().zip(from.iter().flatten()) {
+                *own = own.or(here, *from);
             }
             left = left & !here;
         }
