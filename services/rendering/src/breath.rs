@@ -34,7 +34,7 @@ impl<'a> Breather<'a> {
         let nodes = |pitch: f32| (0..3).map(|c| extent(c) / f64::from(pitch) + 4.0).product::<f64>();
         // a picture's own lattice takes half of what it is given: a third of the whole, as the patient's share is the dearer
         let within_mm = 0.66 * tolerance_mm as f32;
-        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm, ..WarpOptions::default() };
+        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm };
         let collapsed = Collapsed::new(patient.model(), tolerance_mm as f32);
         let warp = Warp::new(info, options(PITCHES_MM[0]));
         let mut breather = Self { patient, info: info.clone(), collapsed, warp, report: WarpReport::default(), view_mm: 0.5 * within_mm };
