@@ -5,12 +5,15 @@
 //! as thick); what the transfer function does not show is not shown by a label.
 
 use crate::lanes::{Float, Int, Lanes, MOST};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Labels on the volume's own grid.
 #[derive(Clone, Debug)]
 pub struct Labels {
     size: [usize; 3],
     voxels: Vec<u8>,
+    /// differs wherever voxels may: they never change once they are here
+    number: u64,
     /// r, g, b, and the share of it (0 leaves the transfer function's colour)
     pub colors: [[f32; 4]; 256],
     /// factor of extinction
@@ -32,12 +35,17 @@ impl Labels {
             let [r, g, b] = hsv(n as f32 * 0.618_034, if n % 3 == 0 { 0.55 } else { 0.8 }, if n % 2 == 0 { 0.8 } else { 1.0 });
             *color = [r, g, b, 0.8];
         }
-        Ok(Self { size, voxels, colors, opacity: [1.0; 256] })
+        static NUMBERS: AtomicU64 = AtomicU64::new(1);
+        Ok(Self { size, voxels, number: NUMBERS.fetch_add(1, Relaxed), colors, opacity: [1.0; 256] })
     }
 
     /// Voxels along each axis.
     pub fn size(&self) -> [usize; 3] {
         self.size
+    }
+
+    pub(crate) fn voxels(&self) -> (&[u8], u64) {
+        (&self.voxels, self.number)
     }
 
     /// Label of the voxel nearest to a continuous index; 0 outside.

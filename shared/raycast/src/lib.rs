@@ -36,6 +36,7 @@ pub mod skip;
 #[cfg(test)]
 mod tests;
 pub mod transfer;
+pub mod twin;
 pub mod ultrasound;
 mod walk;
 pub mod warp;

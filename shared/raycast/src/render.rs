@@ -201,7 +201,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
     Ok(())
 }
 
-fn check_extras<S: BrickSource + ?Sized>(extras: &Extras<'_>, source: &S) -> Result<(), RenderError> {
+pub(crate) fn check_extras<S: BrickSource + ?Sized>(extras: &Extras<'_>, source: &S) -> Result<(), RenderError> {
     let fault = |text: &str| Err(RenderError::Extras(text.into()));
     if !(extras.barrel >= 0.0 && extras.barrel.is_finite()) {
         return fault("a barrel distortion must be 0 or more");
@@ -220,7 +220,7 @@ fn check_extras<S: BrickSource + ?Sized>(extras: &Extras<'_>, source: &S) -> Res
     Ok(())
 }
 
-fn check<S: BrickSource + ?Sized>(
+pub(crate) fn check<S: BrickSource + ?Sized>(
     source: &S,
     skip: &Skip,
     camera: &Camera,

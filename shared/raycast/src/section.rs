@@ -117,6 +117,11 @@ impl Section {
         Self { plane, center, mm_per_pixel: mm_per_pixel.max(1e-6), level: 40.0, window: 400.0, slab_mm: 0.0, slab_mode: SlabMode::Mean }
     }
 
+    /// As many planes of a slab as lie half a voxel apart.
+    pub(crate) fn planes(&self, min_spacing: f64) -> usize {
+        if self.slab_mm > 0.0 { ((2.0 * self.slab_mm / min_spacing).ceil() as usize).clamp(1, 512) + 1 } else { 1 }
+    }
+
     /// Patient position of a pixel's centre [mm, LPS].
     pub fn position(&self, x: f64, y: f64, width: usize, height: usize) -> [f64; 3] {
         let [right, down] = self.plane.axes();
@@ -142,8 +147,7 @@ pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, ove
     let labels = overlay.labels.filter(|l| l.size() == grid.size);
     let [right, down] = section.plane.axes().map(Vector3::from);
     let normal = right.cross(&down);
-    // as many planes as lie half a voxel apart
-    let planes = if section.slab_mm > 0.0 { ((2.0 * section.slab_mm / grid.min_spacing()).ceil() as usize).clamp(1, 512) + 1 } else { 1 };
+    let planes = section.planes(grid.min_spacing());
     let rest = |at: [f64; 3]| match warp {
         Some(warp) => warp.rest_index(grid.index_from_world(at).map(|v| v as f32)).map(f64::from),
         None => grid.index_from_world(at),

@@ -20,7 +20,7 @@ use rayon::prelude::*;
 pub const REACH: u8 = 15;
 
 /// Beside a distance of 0: occupied, and nothing in the cell is very opaque.
-pub(crate) const GENTLE: u8 = 0x80;
+pub const GENTLE: u8 = 0x80;
 /// Kernels read four bytes at a cell.
 const PADDING: usize = 3;
 

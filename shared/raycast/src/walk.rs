@@ -25,7 +25,7 @@ use maille_volume::{
 };
 
 /// No piece of ray before a body is shorter [steps].
-pub(crate) const LAST_PIECE: f32 = 1e-3;
+pub const LAST_PIECE: f32 = 1e-3;
 /// Fraction bits of the weights along x.
 const WEIGHT: f32 = 16384.0;
 

@@ -4,6 +4,7 @@
 //! refined, up to `finest`, while its error is above the tolerance.
 
 use super::field::{Lazy, Motion, WarpError, Whole};
+use crate::twin::Lattice;
 use maille_displacement::{Inverter, RowField, Scheme};
 use maille_volume::{Grid, VolumeInfo};
 use nalgebra::{Matrix3, Vector3};
@@ -90,6 +91,17 @@ impl Warp {
     /// How far rays must look beyond the volume [index].
     pub(crate) fn margin(&self) -> [f32; 3] {
         self.margin
+    }
+
+    /// As the twin on a GPU reads it.
+    pub(crate) fn lattice(&self) -> Lattice<'_> {
+        Lattice {
+            origin: self.origin,
+            per_pitch: self.per_pitch,
+            counts: self.counts,
+            nodes: bytemuck::cast_slice(&self.nodes),
+            spacing: self.spacing,
+        }
     }
 
     /// The error that was allowed [mm].

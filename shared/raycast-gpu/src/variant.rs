@@ -1,0 +1,219 @@
+//! Shader variants: WGSL put together from pieces, so that a picture's shader holds only what the picture asks for.
+//!
+//! A line `#if A|B` keeps what follows, up to `#else` or `#end`, when one of its words is among the variant's; blocks may be nested. Sizes
+//! that do not change while a volume is shown are constants of the source.
+
+use maille_volume::{
+    BrickLayout,
+    brick::{Brick, CELL, CELLS_EDGE, EDGE, ROW, SLICE},
+};
+use std::fmt::Write as _;
+
+/// Bits of a slot's number within its buffer; those above name the buffer.
+pub(crate) const SLOT_BITS: u32 = 26;
+/// Larger than any distance in a picture: instead of an infinity, which shaders need not know.
+pub(crate) const FAR: f32 = 3.0e38;
+/// A section's pixel is in the volume up to this far beyond the outermost voxels [index]: f32 has no better on 512 voxels.
+const NEARLY: f32 = 1e-4;
+
+/// What a picture shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Shows {
+    /// composition under the transfer function
+    Volume,
+    /// the first surface
+    Isosurface,
+    /// both
+    Both,
+    /// a radiograph
+    Xray,
+    /// a flat section
+    Section,
+}
+
+/// All that makes one shader another.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Variant {
+    /// the view
+    pub shows: Shows,
+    /// light
+    pub shaded: bool,
+    /// the light is at the eye
+    pub at_eye: bool,
+    /// rays or positions go through a displacement field
+    pub warp: bool,
+    /// colours of organs
+    pub labels: bool,
+    /// depth is asked for
+    pub depth: bool,
+    /// rays end at solid bodies
+    pub ends: bool,
+    /// pieces of ray by weight
+    pub pieces: bool,
+    /// a lens with barrel distortion
+    pub barrel: bool,
+    /// a thick section
+    pub slab: bool,
+    /// the largest value through a section instead of the mean
+    pub maximum: bool,
+    /// the displacement over a section
+    pub overlay: bool,
+}
+
+impl Variant {
+    /// Nothing but a view.
+    pub fn of(shows: Shows) -> Self {
+        Self {
+            shows,
+            shaded: false,
+            at_eye: false,
+            warp: false,
+            labels: false,
+            depth: false,
+            ends: false,
+            pieces: false,
+            barrel: false,
+            slab: false,
+            maximum: false,
+            overlay: false,
+        }
+    }
+
+    fn has(&self, word: &str) -> bool {
+        match word {
+            "SHADED" => self.shaded,
+            "AT_EYE" => self.at_eye,
+            "WARP" => self.warp,
+            "LABELS" => self.labels,
+            "DEPTH" => self.depth,
+            "ENDS" => self.ends,
+            "PIECES" => self.pieces,
+            "BARREL" => self.barrel,
+            "SLAB" => self.slab,
+            "MAXIMUM" => self.maximum,
+            "OVERLAY" => self.overlay,
+            "ISOSURFACE" => self.shows == Shows::Isosurface,
+            "XRAY" => self.shows == Shows::Xray,
+            "TABLE" => matches!(self.shows, Shows::Volume | Shows::Both),
+            "SURFACE" => matches!(self.shows, Shows::Isosurface | Shows::Both),
+            "RAYS" => self.shows != Shows::Section,
+            other => unreachable!("{other} is no word of a variant"),
+        }
+    }
+
+    /// The WGSL of this variant for volumes of a layout whose voxels lie in as many buffers.
+    pub fn source(&self, layout: &BrickLayout, buffers: usize) -> String {
+        let mut pieces = vec![];
+        if self.has("RAYS") {
+            pieces.extend([include_str!("frame.wgsl"), include_str!("skip.wgsl")]);
+        }
+        pieces.push(include_str!("voxels.wgsl"));
+        if self.warp {
+            pieces.push(include_str!("warp.wgsl"));
+        }
+        if self.labels {
+            pieces.push(include_str!("labels.wgsl"));
+        }
+        match self.has("RAYS") {
+            true if self.shows == Shows::Xray => pieces.push(include_str!("scalar.wgsl")),
+            true => pieces.extend([include_str!("shade.wgsl"), include_str!("scalar.wgsl")]),
+            false => pieces.push(include_str!("section.wgsl")),
+        }
+        let mut out = constants(layout);
+        words(&mut out, buffers);
+        for piece in pieces {
+            self.keep(piece, &mut out);
+        }
+        out
+    }
+
+    fn keep(&self, piece: &str, out: &mut String) {
+        // whether each open block is kept
+        let mut open: Vec<bool> = Vec::new();
+        for line in piece.lines() {
+            let line_of = line.trim_start();
+            if let Some(condition) = line_of.strip_prefix("#if ") {
+                open.push(condition.split('|').any(|word| self.has(word.trim())));
+            } else if line_of == "#else" {
+                let last = open.last_mut().expect("#else follows an #if");
+                *last = !*last;
+            } else if line_of == "#end" {
+                open.pop().expect("#end follows an #if");
+            } else if open.iter().all(|&kept| kept) {
+                out.push_str(line);
+                out.push('\n');
+            }
+        }
+        assert!(open.is_empty(), "every #if has its #end");
+    }
+}
+
+fn constants(layout: &BrickLayout) -> String {
+    use maille_raycast::twin::{GENTLE, LAST_PIECE, REFINEMENTS, TINY, ZERO_GRADIENT};
+    let mut out = String::new();
+    let mut put = |text: String| writeln!(out, "{text}").expect("a string takes all");
+    for (axis, c) in ["X", "Y", "Z"].into_iter().zip(0..) {
+        put(format!("const SIZE_{axis}: i32 = {};", layout.size[c]));
+        put(format!("const LAST_CELL_{axis}: i32 = {};", layout.size[c].saturating_sub(2)));
+        put(format!("const BRICKS_{axis}: i32 = {};", layout.counts[c]));
+        put(format!("const CELLS_{axis}: i32 = {};", layout.counts[c] * CELLS_EDGE));
+    }
+    put(format!("const EDGE: i32 = {EDGE};\nconst CELL: i32 = {CELL};\nconst ROW: u32 = {ROW}u;\nconst SLICE: u32 = {SLICE}u;"));
+    put(format!("const HALVES: u32 = {}u;", size_of::<Brick>() / 2));
+    put(format!("const SLOT_BITS: u32 = {SLOT_BITS}u;\nconst SLOT_MASK: u32 = {}u;", (1u32 << SLOT_BITS) - 1));
+    put(format!("const GENTLE: u32 = {GENTLE}u;\nconst REFINEMENTS: i32 = {REFINEMENTS};"));
+    put(format!("const TINY: f32 = {TINY:e};\nconst LAST_PIECE: f32 = {LAST_PIECE:e};\nconst ZERO_GRADIENT: f32 = {ZERO_GRADIENT:e};"));
+    put(format!("const FAR: f32 = {FAR:e};\nconst NEARLY: f32 = {NEARLY:e};"));
+    out
+}
+
+/// Bindings of the voxels' buffers, and the function that reads a word of one of them.
+fn words(out: &mut String, buffers: usize) {
+    let mut put = |text: String| writeln!(out, "{text}").expect("a string takes all");
+    for n in 0..buffers {
+        put(format!("@group(0) @binding({}) var<storage, read> voxels{n}: array<u32>;", VOXELS_BINDING as usize + n));
+    }
+    if buffers == 1 {
+        put("fn word(chunk: u32, n: u32) -> u32 {\n    return voxels0[n];\n}".into());
+        return;
+    }
+    put("fn word(chunk: u32, n: u32) -> u32 {\n    switch chunk {".into());
+    for n in 0..buffers - 1 {
+        put(format!("        case {n}u: {{ return voxels{n}[n]; }}"));
+    }
+    put(format!("        default: {{ return voxels{}[n]; }}\n    }}\n}}", buffers - 1));
+}
+
+/// Number of the first binding of voxels.
+pub(crate) const VOXELS_BINDING: u32 = 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shader_holds_only_what_its_picture_asks_for() {
+        let layout = BrickLayout::new([40, 30, 20]);
+        let plain = Variant::of(Shows::Volume).source(&layout, 1);
+        for absent in
+            ["lattice", "bent", "offset_at", "label", "solid", "depths", "frame.shading", "fn gradient", "refine", "attenuation", "switch"]
+        {
+            assert!(!code(&plain).contains(absent), "{absent} in a plain picture");
+        }
+        let warped = Variant { warp: true, shaded: true, ..Variant::of(Shows::Both) }.source(&layout, 3);
+        for present in ["lattice", "offset_at", "fn gradient", "refine", "switch", "voxels2"] {
+            assert!(code(&warped).contains(present), "{present} missing");
+        }
+        let section = Variant { maximum: true, ..Variant::of(Shows::Section) }.source(&layout, 1);
+        for absent in ["Ray", "table", "lattice", "label", "distances", "atan2"] {
+            assert!(!code(&section).contains(absent), "{absent} in a section");
+        }
+        assert!(!code(&Variant::of(Shows::Xray).source(&layout, 1)).contains("table"));
+    }
+
+    /// Without comments and the frame's one set of numbers.
+    fn code(source: &str) -> String {
+        let lines = source.lines().filter(|l| !l.trim_start().starts_with("//"));
+        lines.filter(|l| !l.trim_end().ends_with("f32,") && !l.starts_with("const")).collect::<Vec<_>>().join("\n")
+    }
+}
