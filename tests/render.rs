@@ -164,13 +164,37 @@ fn what_cannot_be_done_is_one_sentence_and_status_1() {
         vec![text.to_str().unwrap(), "-o", out],
         vec![good, "-o", "/no/such/folder/out.png"],
         vec![good, "-o", out, "--transfer", "no-such-preset"],
-        vec![good, "-o", out, "--backend", "gpu"],
     ] {
         let output = maille(&arguments);
         let error = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{arguments:?}: {error}");
         assert!(error.trim().lines().count() == 1 && !error.contains("panicked"), "{arguments:?}: {error}");
     }
+}
+
+#[test]
+fn the_gpu_draws_what_the_cpu_draws_and_without_one_it_is_said() {
+    let folder = Folder::new("gpu");
+    let (volume, out) = (folder.path("ball.nrrd"), folder.path("out.png"));
+    write_nrrd(&volume, |x| ball(x, [0.0; 3], 20.0).clamp(-1000.0, 1000.0));
+    let asked = ["--iso=0", "--size=60x48", "--backend=gpu"];
+    let mut command = Command::new(env!("CARGO_BIN_EXE_maille"));
+    command.arg("render").arg(&volume).arg("-o").arg(&out).args(asked);
+    let without = command.env("VK_DRIVER_FILES", "/no/such/driver").env("VK_ICD_FILENAMES", "/no/such/driver").output().unwrap();
+    let error = String::from_utf8_lossy(&without.stderr);
+    assert_eq!(without.status.code(), Some(1), "{error}");
+    assert!(error.contains("no GPU that Vulkan knows") && error.trim().lines().count() == 1, "{error}");
+    let with = maille(&[&[volume.to_str().unwrap(), "-o", out.to_str().unwrap()], &asked[..]].concat());
+    let error = String::from_utf8_lossy(&with.stderr);
+    if !with.status.success() && error.contains("no GPU that Vulkan knows") {
+        assert!(std::env::var_os("CI").is_none(), "CI needs a Vulkan driver (mesa-vulkan-drivers): {error}");
+        eprintln!("SKIPPED: {error}");
+        return;
+    }
+    let (_, _, gpu) = picture(&volume, &out, &asked);
+    let (_, _, cpu) = picture(&volume, &out, &asked[..2]);
+    let far = cpu.iter().zip(&gpu).filter(|(a, b)| a.abs_diff(**b) > 2).count();
+    assert!(far * 200 <= cpu.len() && cpu.iter().any(|&v| v > 20), "{far} of {} bytes differ", cpu.len());
 }
 
 #[test]

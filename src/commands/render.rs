@@ -7,6 +7,7 @@ use maille_raycast::{
     Camera, Extras, Geometry, Labels, Light, MeshView, Overlay, Picture, Plane, Preset, Probe, Section, Settings, Skip, SlabMode, Step,
     Transfer, Ultrasound, render_extra, section_with, ultrasound,
 };
+use maille_raycast_gpu::{Choice, Gpu, GpuError, Renderer};
 use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
 use maille_surface::{Mesh, read_mesh};
 use maille_volume::{BrickSource as _, BrickedVolume, Volume, io};
@@ -66,7 +67,7 @@ pub struct Args {
     /// grey levels of a section: centre and width [HU] [default: the scene's, or 40,400]
     #[arg(long, value_name = "CENTRE,WIDTH", value_parser = pair, allow_hyphen_values = true)]
     window: Option<[f64; 2]>,
-    /// what renders
+    /// what renders; gpu needs Vulkan
     #[arg(long, value_enum, default_value_t = Backend::Cpu)]
     backend: Backend,
     /// threads [default: all cores]
@@ -137,9 +138,6 @@ enum Backend {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
-    if args.backend == Backend::Gpu {
-        return Err(Failure::Refused("this build has no GPU renderer yet: leave --backend out".into()));
-    }
     if args.threads == Some(0) || args.time == Some(0) {
         return Err(Failure::Usage("--threads and --time need at least 1".into()));
     }
@@ -164,11 +162,22 @@ pub fn run(args: &Args) -> Outcome {
         .build()
         .map_err(|e| Failure::Refused(format!("no threads to render with: {e}")))?;
     let frames = args.time.unwrap_or(1);
+    let mut gpu = match args.backend {
+        Backend::Cpu => None,
+        Backend::Gpu => Some(open_gpu(&bricks)?),
+    };
+    let refused = |e: &dyn std::fmt::Display| Failure::Refused(format!("{}: {e}", args.input.display()));
     let times = match plane {
         Some(plane) => {
             let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
             let overlay = Overlay { labels: labels.as_ref(), geometry: Some(&geometry), ..Overlay::default() };
-            timed(frames, || pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)))
+            let mut outcome = Ok(());
+            let times = timed(frames, || match &mut gpu {
+                None => pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)),
+                Some(gpu) => outcome = gpu.section_with(&bricks, &section_of, &overlay, &mut picture).map(drop),
+            });
+            outcome.map_err(|e| refused(&e))?;
+            times
         }
         None if args.view == View::Ultrasound => {
             let fan = fan(args, scene.as_ref(), &bricks)?;
@@ -184,9 +193,18 @@ pub fn run(args: &Args) -> Outcome {
             let barrel = args.more.barrel.unwrap_or(0.0);
             let extras = Extras { labels: labels.as_ref(), barrel, geometry: Some(&geometry), ..Extras::default() };
             let mut outcome = Ok(());
-            let times =
-                timed(frames, || outcome = pool.install(|| render_extra(&extras, &bricks, &skip, &camera, &settings, &mut picture)));
-            outcome.map_err(|e| Failure::Refused(format!("{}: {e}", args.input.display())))?;
+            let times = timed(frames, || {
+                let drawn = match &mut gpu {
+                    None => {
+                        pool.install(|| render_extra(&extras, &bricks, &skip, &camera, &settings, &mut picture)).map_err(|e| refused(&e))
+                    }
+                    Some(gpu) => gpu.render(&extras, &bricks, &skip, &camera, &settings, &mut picture).map(drop).map_err(|e| refused(&e)),
+                };
+                if drawn.is_err() {
+                    outcome = drawn;
+                }
+            });
+            outcome?;
             times
         }
     };
@@ -196,6 +214,16 @@ pub fn run(args: &Args) -> Outcome {
         println!("{frame}");
     }
     write_png(&args.output, &picture)
+}
+
+/// A GPU with room for the volume. Asked for by name, it is not replaced by the CPU in silence.
+fn open_gpu(bricks: &BrickedVolume) -> Result<Renderer, Failure> {
+    let refused = |e: GpuError| Failure::Refused(format!("{e}: leave --backend out to render on the CPU"));
+    let gpu = Gpu::open(&Choice::any()).map_err(refused)?;
+    if gpu.is_software() {
+        eprintln!("maille: {} is no GPU but a program on the CPU, and slower than this program's own", gpu.name());
+    }
+    Renderer::for_volume(gpu, bricks.layout()).map_err(refused)
 }
 
 /// The volume, and the scene if it came from one.
