@@ -312,7 +312,7 @@ fn material(t: &NeedleTissue) -> Material {
         stiffness_n_per_mm: t.stiffness_n_per_mm,
         a1_n_per_mm: t.a1_n_per_mm,
         a2_n_per_mm2: t.a2_n_per_mm2,
-        cutting_force_n: t.cutting_force_n.unwrap_or(f64::INFINITY),
+        cutting_force_n: t.cutting_force_n,
         friction_n: t.friction_n,
         capsule: t.capsule_n.map(|force| Capsule { cutting_force_n: force, thickness_mm: t.capsule_mm }),
         relaxing: t.relaxing,

@@ -193,6 +193,11 @@ fn prepare(scene: &mut Scene, name: &str) {
                 tool.kind = ToolKind::Blade;
             }
         }
+        "needle" => {
+            if let Some(tool) = &mut scene.tool {
+                tool.kind = ToolKind::Needle;
+            }
+        }
         "palpation" => {
             if let Some(tool) = &mut scene.tool {
                 (tool.shape, tool.radius_mm) = (Shape::Finger, tool.radius_mm.max(5.0));

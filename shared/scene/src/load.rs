@@ -431,7 +431,7 @@ fn check_needle(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
             ("stiffness_n_per_mm", Some(row.stiffness_n_per_mm), [1e-3, 1e3], "N/mm"),
             ("a1_n_per_mm", Some(row.a1_n_per_mm), [1e-3, 1e3], "N/mm"),
             ("a2_n_per_mm2", Some(row.a2_n_per_mm2), [0.0, 1e3], "N/mm²"),
-            ("cutting_force_n", row.cutting_force_n, [1e-3, 1e3], "N"),
+            ("cutting_force_n", Some(row.cutting_force_n).filter(|force| *force != f64::INFINITY), [1e-3, 1e3], "N"),
             ("friction_n", Some(row.friction_n), [0.0, 1e3], "N"),
             ("capsule_n", row.capsule_n, [1e-3, 1e3], "N"),
             ("capsule_mm", Some(row.capsule_mm), [0.0, 100.0], "mm"),

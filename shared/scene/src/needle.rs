@@ -51,9 +51,8 @@ pub struct NeedleTissue {
     pub a1_n_per_mm: f64,
     /// a₂, its hardening [N/mm²], 0 to 1000
     pub a2_n_per_mm2: f64,
-    /// cutting force [N]; absent: it cannot be cut
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub cutting_force_n: Option<f64>,
+    /// cutting force [N]; `inf`: it cannot be cut
+    pub cutting_force_n: f64,
     /// friction R [N] a node, 0 to 1000
     pub friction_n: f64,
     /// layer at the entry: force at which it gives way [N]
@@ -79,7 +78,7 @@ impl Default for NeedleTissue {
             stiffness_n_per_mm: 0.5,
             a1_n_per_mm: 1.2,
             a2_n_per_mm2: 0.0,
-            cutting_force_n: Some(0.3),
+            cutting_force_n: 0.3,
             friction_n: 0.025,
             capsule_n: None,
             capsule_mm: 0.0,
@@ -116,7 +115,7 @@ pub fn defaults() -> Vec<NeedleTissue> {
         hu,
         ..NeedleTissue::default()
     };
-    let cut = |n: f64, row: NeedleTissue| NeedleTissue { cutting_force_n: Some(n), ..row };
+    let cut = |n: f64, row: NeedleTissue| NeedleTissue { cutting_force_n: n, ..row };
     let layer = |n: f64, mm: f64, row: NeedleTissue| NeedleTissue { capsule_n: Some(n), capsule_mm: mm, ..row };
     let forbidden = |row: NeedleTissue| NeedleTissue { forbidden: true, ..row };
     vec![
@@ -136,7 +135,7 @@ pub fn defaults() -> Vec<NeedleTissue> {
         forbidden(NeedleTissue {
             stiffness_n_per_mm: 5.0,
             a1_n_per_mm: 4.0,
-            cutting_force_n: None,
+            cutting_force_n: f64::INFINITY,
             ..row("bone", &[6, 7, 5, 27], Some([250.0, 4000.0]))
         }),
         forbidden(layer(0.6, 0.0, row("other organ", &[9, 14, 16, 24, 25, 26], None))),

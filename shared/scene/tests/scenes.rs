@@ -13,14 +13,15 @@ fn scenes() -> Vec<PathBuf> {
 }
 
 #[test]
-fn every_scene_of_the_project_loads_and_plans_three_processes_and_a_page() {
+fn every_scene_of_the_project_loads_and_plans_what_it_calls_for_and_a_page() {
     for path in scenes() {
         let scene = Scene::load(&path).unwrap_or_else(|e| panic!("{e}"));
         assert!(!scene.name.is_empty() && !scene.description.is_empty(), "{}", path.display());
         let plan = plan(&scene, &Grid::axis_aligned([64, 64, 64], [2.0, 2.0, 2.0]), Machine { cores: 2 });
-        for process in [Process::Haptic, Process::Deformation, Process::Rendering, Process::Console] {
+        for process in [Process::Haptic, Process::Rendering, Process::Console] {
             assert!(plan.starts(process), "{}: {process:?}", path.display());
         }
+        assert_eq!(plan.starts(Process::Deformation), scene.has_effect("deformation"), "{}", path.display());
     }
 }
 
