@@ -12,6 +12,15 @@ use maille_volume::BrickSource;
 /// Planes of views 1 to 3, in the order of [`maille_contract::messages::VIEWS`].
 const PLANES: [Plane; 3] = [Plane::Axial, Plane::Coronal, Plane::Sagittal];
 
+/// Least radius of a body in the 3D view [pixels]: then every pixel along it has its middle inside.
+const LEAST_PIXELS: f64 = 0.75;
+
+/// A capsule as thick as it must be for an eye to see it, by its angle [mm of radius a mm of distance].
+fn seen_from(capsule: &Capsule, eye: [f64; 3], least: f64) -> Capsule {
+    let away = |p: [f64; 3]| (0..3).map(|c| (p[c] - eye[c]).powi(2)).sum::<f64>().sqrt();
+    Capsule { radius: capsule.radius.max(least * away(capsule.a).min(away(capsule.b))), ..*capsule }
+}
+
 /// Draws frames into memory of its own.
 pub(crate) struct Composer {
     skip: Option<Skip>,
@@ -56,8 +65,12 @@ impl Composer {
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
         let bodies = Geometry { capsules, meshes: &[] };
+        // what is thinner than a pixel would be dots where it meets the middles of pixels
+        let pixel = 2.0 * (camera.fov_deg.to_radians() / 2.0).tan() / whole.height.max(1) as f64;
+        let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
+        let in_3d = Geometry { capsules: &thick, meshes: &[] };
         // an endoscope does not see itself
-        let extras = Extras { warp, geometry: Some(&bodies).filter(|_| !at_tip), ..Extras::default() };
+        let extras = Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), ..Extras::default() };
         render_extra(&extras, source, skip, &camera, &settings, whole)?;
         let [level, window] = view.window_hu();
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
@@ -86,5 +99,19 @@ impl Composer {
             offset = end;
         }
         header
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thin_body_far_away_is_drawn_a_pixel_wide_and_a_thick_one_as_it_is() {
+        let capsule = |radius| Capsule { a: [0.0, 0.0, 400.0], b: [0.0, 0.0, 500.0], radius, color: [1.0; 3] };
+        assert_eq!(seen_from(&capsule(0.1), [0.0; 3], 0.001).radius, 0.4);
+        assert_eq!(seen_from(&capsule(3.0), [0.0; 3], 0.001), capsule(3.0));
+        // an eye inside it makes it no thicker
+        assert_eq!(seen_from(&capsule(0.1), [0.0, 0.0, 400.0], 0.001).radius, 0.1);
     }
 }
