@@ -153,13 +153,25 @@ fn triple(text: &str) -> Result<[f64; 3], String> {
         if !value.is_finite() {
             return Err(format!("`{part}` is not a finite number"));
         }
+        // beyond it f32 has no millimetres left
+        if value.abs() > FARTHEST_MM {
+            return Err(format!("`{part}` mm is further than a kilometre: no patient is there"));
+        }
     }
     Ok(out)
 }
 
+/// Places and pushes beyond this are refused [mm].
+const FARTHEST_MM: f64 = 1e6;
+
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let tissue = tissue(args)?;
+    let written: Vec<_> =
+        [Some(&args.output), args.displacement.as_ref(), args.limits.as_ref(), args.links.as_ref()].into_iter().flatten().collect();
+    if let Some(twice) = written.iter().enumerate().find_map(|(n, path)| written[..n].contains(path).then_some(path)) {
+        return Err(Failure::Usage(format!("{} is to be written twice: give each output a file of its own", twice.display())));
+    }
     let refused = |sentence: String| Failure::Refused(sentence);
     let reading = read(&args.volume, &ReadOptions::default()).map_err(|e| refused(e.to_string()))?;
     let volume = Volume::from_image(&reading.image).map_err(|e| refused(format!("{}: {e}", args.volume.display())))?;
@@ -379,7 +391,7 @@ mod tests {
     #[test]
     fn a_push_may_begin_with_a_minus_and_must_be_finite() {
         assert_eq!("-1,2.5,3e1:0,-6,0".parse(), Ok(Push { point: [-1.0, 2.5, 30.0], vector: [0.0, -6.0, 0.0] }));
-        for bad in ["1,2,3", "1,2:3,4,5", "1,2,3:4,5,x", "1,2,NaN:0,0,0", "1,2,3:inf,0,0", "1,2,3:4,5,6:7"] {
+        for bad in ["1,2,3", "1,2:3,4,5", "1,2,3:4,5,x", "1,2,NaN:0,0,0", "1,2,3:inf,0,0", "1,2,3:2e6,0,0", "1,2,3:4,5,6:7"] {
             assert!(bad.parse::<Push>().is_err(), "{bad}");
         }
     }
