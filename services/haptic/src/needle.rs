@@ -24,7 +24,7 @@ use maille_store::Region;
 use maille_transport::Domain;
 use maille_volume::{BrickSource, Grid, Sampler};
 
-/// Torque of a device that can give one [N·mm].
+/// Torque of a device that tells of no limit of its own [N·mm].
 const MAX_TORQUE_N_MM: f64 = 150.0;
 /// Ticks between two words to the log.
 const LOG_EVERY: u64 = 100;
@@ -96,7 +96,14 @@ pub(crate) struct NeedleStage {
 
 impl NeedleStage {
     /// The scene's needle; `None` when the scene has none. Everything that allocates happens here.
-    pub fn new(domain: &Domain, scene: &Scene, grid: &Grid, limits: Limits) -> Result<Option<Self>, HapticError> {
+    /// `device_torque_n_mm`: the real device's own limit of torque, 0 where it can give none.
+    pub fn new(
+        domain: &Domain,
+        scene: &Scene,
+        grid: &Grid,
+        limits: Limits,
+        device_torque_n_mm: Option<f64>,
+    ) -> Result<Option<Self>, HapticError> {
         if !scene.has_effect("needle") {
             return Ok(None);
         }
@@ -112,7 +119,8 @@ impl NeedleStage {
         }
         rows.by_value = n.tissue.iter().enumerate().filter_map(|(row, t)| Some((t.hu?, row as u8 + 1))).collect();
         let room = tool.path().nodes().len().max(512);
-        let torque = Limits { max_force_n: MAX_TORQUE_N_MM, max_slew_n_per_s: 50.0 * MAX_TORQUE_N_MM, ..limits };
+        let most_n_mm = device_torque_n_mm.map_or(MAX_TORQUE_N_MM, |device| device.min(MAX_TORQUE_N_MM));
+        let torque = Limits { max_force_n: most_n_mm, max_slew_n_per_s: 50.0 * most_n_mm, ..limits };
         let mut log: NeedleLog = bytemuck::Zeroable::zeroed();
         log.to_target_mm = [f64::NAN; 2];
         Ok(Some(Self {

@@ -65,7 +65,7 @@ impl<'a> Loop<'a> {
             scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
         let way = way.ok_or(HapticError::NoTool)?;
         let real = real.map(|(kind, options)| device::open(kind, options, scene, &way)).transpose()?;
-        let needle = NeedleStage::new(domain, scene, &reader.info().grid, config.limits)?;
+        let needle = NeedleStage::new(domain, scene, &reader.info().grid, config.limits, profile.as_ref().map(|p| p.max_torque_n_mm))?;
         Ok(Self {
             reader,
             needle,
@@ -130,12 +130,7 @@ impl<'a> Loop<'a> {
             self.residual_mm = moment.residual_mm;
             self.unmapped = vouched && moment.residual_mm.is_none();
         }
-        self.operator.write(out.force_n, out.torque_n_mm);
-        self.ticks += 1;
-        if self.operator.is_external() {
-            let incarnation = life.incarnation();
-            control.device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence: self.ticks, incarnation, force_n: out.force_n });
-        }
+        self.give(life, monotonic_ns, &out);
         self.hand_over(control, now_ns, epoch, [world, pose.direction], tip_reference_mm, &out);
         self.last = Some(out);
         out.force_n
@@ -168,15 +163,20 @@ impl<'a> Loop<'a> {
         stage.publish(control);
         let (tip_reference_mm, direction) = (stage.tip_reference_mm(), stage.direction());
         let epoch = snapshot.epoch();
-        self.operator.write(out.force_n, out.torque_n_mm);
-        self.ticks += 1;
-        if self.operator.is_external() {
-            let incarnation = life.incarnation();
-            control.device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence: self.ticks, incarnation, force_n: out.force_n });
-        }
+        self.give(life, monotonic_ns, &out);
         self.hand_over(control, now_ns, epoch, [direction, direction], tip_reference_mm, &out);
         self.last = Some(out);
         out.force_n
+    }
+
+    /// Force and torque to the device, and to whoever drives one from outside.
+    fn give(&mut self, life: &Life, monotonic_ns: u64, out: &TickOutputs) {
+        self.operator.write(out.force_n, out.torque_n_mm);
+        self.ticks += 1;
+        if self.operator.is_external() {
+            let (sequence, incarnation) = (self.ticks, life.incarnation());
+            life.control().device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence, incarnation, force_n: out.force_n });
+        }
     }
 
     /// Takes the latest threshold and the latest command, where there are new ones.

@@ -77,11 +77,17 @@ pub struct HDErrorInfo { code: c_uint, internal: c_int, device: c_uint }
     // another thread, as the servo loop is
     let (call, data) = (call as usize, data as usize);
     std::thread::spawn(move || {
+        // SAFETY: it is the address of such a function, given by the caller a few lines above, and functions stay where they are.
         let call: extern "C" fn(*mut c_void) -> c_uint = unsafe { std::mem::transmute(call) };
         call(data as *mut c_void)
     }).join().unwrap();
 }
 // for the test
 #[unsafe(no_mangle)] pub extern "C" fn mock_plug(on: c_int) { STATE.lock().unwrap().plugged = on != 0; }
-#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) { for n in 0..3 { unsafe { *to.add(n) = STATE.lock().unwrap().force[n] } } }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) {
+    for n in 0..3 {
+        // SAFETY: the test gives room for three numbers.
+        unsafe { *to.add(n) = STATE.lock().unwrap().force[n] }
+    }
+}
 #[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { let s = STATE.lock().unwrap(); c_int::from(s.open || s.running) }
