@@ -177,6 +177,40 @@ fn a_hand_feels_no_step_while_deformation_or_rendering_is_frozen() {
     }
 }
 
+/// The device `sim` with the hands that issues of stability are about; what each should feel is the closed loop's matter (`maille-contact`), here it is
+/// that the scene's words for it reach that loop, its passivity controller on.
+#[test]
+fn simulated_hands_of_every_kind_press_and_let_go_without_a_step() {
+    let light = "[tool.hand]\ngrip = \"light\"\nmass_kg = 0.12\ntremor_mm = 0.1\nencoder_mm = 0.05\ndelay_ms = 2\ncoulomb_n = 0.05\n";
+    for (name, hand) in [("usual", ""), ("full", "[tool.hand]\ngrip = \"full\"\n"), ("light, trembling, coarse, late", light)] {
+        let scratch = Scratch::new("haptic-sim");
+        let (run, domain, control) = started(&scratch, &pressing("sim", hand), &[]);
+        let until = monotonic_ns() + 5_000_000_000;
+        let (mut seen, mut largest, mut pressed, mut free) = (0u64, 0.0f64, 0u64, 0u64);
+        let mut last: Option<(u64, ToolState)> = None;
+        while monotonic_ns() < until {
+            std::thread::sleep(Duration::from_micros(300));
+            let generation = control.tool.generation();
+            let now = tool(&control);
+            assert!(now.force_n.iter().chain(&now.tip_mm).all(|v| v.is_finite()), "{name}: {now:?}");
+            if let Some((before, state)) = last
+                && generation > before
+            {
+                seen += 1;
+                let step = norm(std::array::from_fn(|c| now.force_n[c] - state.force_n[c]));
+                largest = largest.max(step / (generation - before) as f64);
+                *(if norm(now.force_n) > 0.1 { &mut pressed } else { &mut free }) += 1;
+            }
+            last = Some((generation, now));
+        }
+        drop(control);
+        ended(run, &domain);
+        println!("{name}: {seen} states seen, {pressed} of them above 0.1 N, at most {largest:.4} N a tick");
+        assert!(pressed > 100 && free > 100, "{name}: it presses and lets go: {pressed} and {free}");
+        assert!(largest <= STEP_N, "{name}: {largest} N in one tick");
+    }
+}
+
 /// From a device's service through `maille run --device inverse3` and back, with the device unplugged in mid-press.
 #[test]
 fn a_device_that_is_unplugged_in_mid_run_fades_and_comes_back() {

@@ -7,7 +7,7 @@
 //! for [`SILENT_NS`]), the script takes over from where the tool was left: the offset to the script's way is taken away
 //! smoothly, no faster than [`RETURN_MM_S`], so that nothing jumps.
 
-use maille_contact::{ConsoleDevice, Device as _, DevicePose, Grip, SimulatedHand};
+use maille_contact::{ConsoleDevice, Device as _, DevicePose, DeviceProfile, Grip, SimulatedHand};
 use maille_contract::ToolCommand;
 use maille_contract::messages::{DEVICE_KNOWS_VELOCITY, DEVICE_VALID, DeviceState};
 use maille_device::RemoteDevice;
@@ -22,7 +22,7 @@ enum Holder {
     /// the script itself, exactly followed
     Script,
     /// a hand that follows the script and yields to the force
-    Hand(Box<SimulatedHand>),
+    Hand(Box<SimulatedHand>, Tremor),
     /// a device in another process
     External,
     /// a device of its own thread in this one
@@ -42,13 +42,16 @@ pub(crate) struct Operator {
 }
 
 impl Operator {
-    pub fn new(tool: &Tool, way: Waypoints, real: Option<RemoteDevice>) -> Self {
+    pub fn new(tool: &Tool, rate_hz: f64, way: Waypoints, real: Option<RemoteDevice>) -> Self {
         let start = way.at(0.0);
         let pose = DevicePose { position_mm: start.position_mm, direction: start.direction, velocity_mm_s: None, valid: true };
-        let hand = || Box::new(SimulatedHand::new(grip(&tool.hand), start.position_mm, start.direction));
+        let hand = || {
+            let hand = SimulatedHand::new(grip(&tool.hand), start.position_mm, start.direction);
+            Box::new(hand.with_encoder(tool.hand.encoder_mm, delay_ticks(&tool.hand, rate_hz)))
+        };
         let holder = match (&tool.device, real) {
             (_, Some(real)) => Holder::Real(Box::new(real)),
-            (Device::Sim, _) => Holder::Hand(hand()),
+            (Device::Sim, _) => Holder::Hand(hand(), Tremor::of(&tool.hand)),
             (Device::External, _) => Holder::External,
             _ => Holder::Script,
         };
@@ -151,8 +154,9 @@ impl Operator {
             Holder::Script | Holder::External | Holder::Real(_) => {
                 DevicePose { position_mm: target, direction: way.direction, velocity_mm_s: Some(velocity), valid: true }
             }
-            Holder::Hand(hand) => {
-                hand.set_target(target);
+            Holder::Hand(hand, tremor) => {
+                let shaken = tremor.at(now_ns);
+                hand.set_target(std::array::from_fn(|c| target[c] + shaken[c]));
                 hand.read(now_ns)
             }
         }
@@ -161,7 +165,7 @@ impl Operator {
     /// Force [N] and torque about the handle [N·mm] on the hand.
     pub fn write(&mut self, force_n: [f64; 3], torque_n_mm: [f64; 3]) {
         match &mut self.holder {
-            Holder::Hand(hand) => hand.write(force_n),
+            Holder::Hand(hand, _) => hand.write(force_n),
             Holder::Real(device) => device.write_wrench(force_n, torque_n_mm),
             Holder::Script | Holder::External => {}
         }
@@ -172,7 +176,48 @@ impl Operator {
 }
 
 fn grip(hand: &Hand) -> Grip {
-    Grip { mass_kg: hand.mass_kg, stiffness_n_per_mm: hand.stiffness_n_per_mm, damping_n_s_per_mm: hand.damping_n_s_per_mm, ..Grip::FULL }
+    let [stiffness_n_per_mm, damping_n_s_per_mm, mass_kg] = hand.mechanics();
+    Grip { mass_kg, stiffness_n_per_mm, damping_n_s_per_mm, coulomb_n: hand.coulomb_n, ..Grip::FULL }
+}
+
+/// How late a simulated device's poses are, in whole ticks.
+fn delay_ticks(hand: &Hand, rate_hz: f64) -> usize {
+    (hand.delay_ms * 1e-3 * rate_hz).round().max(0.0) as usize
+}
+
+/// What passivity and limits have to know of the device that a simulated hand holds: as of a device of the Touch class, but with the encoder, the delay and
+/// the mass of the scene's hand.
+pub(crate) fn simulated_profile(hand: &Hand, max_force_n: f64, rate_hz: f64) -> DeviceProfile {
+    DeviceProfile {
+        name: "simulated",
+        max_force_n,
+        max_torque_n_mm: 0.0,
+        max_stiffness_n_per_mm: f64::INFINITY,
+        damping_n_s_per_mm: crate::setup::DEVICE_DAMPING_N_S_PER_MM,
+        coulomb_n: hand.coulomb_n,
+        quantum_mm: hand.encoder_mm,
+        mass_kg: hand.mechanics()[2],
+        delay_s: delay_ticks(hand, rate_hz) as f64 / rate_hz,
+        workspace_mm: f64::INFINITY,
+    }
+}
+
+/// Where a trembling hand is off its way: three sines of nearly one frequency, so that it draws no line.
+struct Tremor {
+    amplitude_mm: f64,
+    radians_per_s: f64,
+}
+
+impl Tremor {
+    fn of(hand: &Hand) -> Self {
+        Self { amplitude_mm: hand.tremor_mm, radians_per_s: std::f64::consts::TAU * hand.tremor_hz }
+    }
+
+    /// Offset at a simulation time [mm]; at most the amplitude along each axis.
+    fn at(&self, now_ns: u64) -> [f64; 3] {
+        let turned = self.radians_per_s * now_ns as f64 * 1e-9;
+        [1.0, 1.07, 0.93].map(|share| self.amplitude_mm * (share * turned).sin())
+    }
 }
 
 #[cfg(test)]
@@ -184,7 +229,7 @@ mod tests {
     fn operator(device: Device) -> Operator {
         let point = |time_s, x| Waypoint { time_s, position_mm: [x, 0.0, 0.0], direction: [1.0, 0.0, 0.0] };
         let way = Waypoints::new(vec![point(0.0, 0.0), point(1.0, 10.0), point(2.0, 0.0)], true, None).unwrap();
-        Operator::new(&Tool { device, ..Tool::default() }, way, None)
+        Operator::new(&Tool { device, ..Tool::default() }, 1e3, way, None)
     }
 
     #[test]
@@ -213,6 +258,24 @@ mod tests {
             let script = operator.way.at(7.999).position_mm;
             assert!((last.unwrap()[0] - script[0]).abs() < 1.0 && last.unwrap()[1].abs() < 0.5, "the script is followed again");
         }
+    }
+
+    #[test]
+    fn a_trembling_hand_stays_near_its_way_and_keeps_moving_at_its_end() {
+        let hand = Hand { tremor_mm: 0.2, tremor_hz: 9.0, encoder_mm: 0.05, delay_ms: 2.0, ..Hand::default() };
+        let still = vec![Waypoint { time_s: 0.0, position_mm: [1.0, 2.0, 3.0], direction: [1.0, 0.0, 0.0] }];
+        let way = Waypoints::new(still, false, None).unwrap();
+        let mut operator = Operator::new(&Tool { device: Device::Sim, hand, ..Tool::default() }, 1e3, way, None);
+        let mut widest = 0.0f64;
+        for tick in 0..2000u64 {
+            let at = operator.read(tick * 1_000_000, 0, None).position_mm;
+            for (c, x) in at.into_iter().enumerate() {
+                assert!(((x / 0.05).round() * 0.05 - x).abs() < 1e-9, "whole encoder steps: {x}");
+                widest = widest.max((x - [1.0, 2.0, 3.0][c]).abs());
+            }
+        }
+        // at 9 Hz the mass still follows the grip, with some resonance
+        assert!((0.1..0.5).contains(&widest), "{widest} mm");
     }
 
     #[test]

@@ -5,13 +5,13 @@ use maille_scene::{Scene, Shape, Tissue, Tool};
 
 /// Damping of a device of the Touch class [N·s/mm] (5 N·s/m, CHAI3D's table of devices): what the coupling may count on
 /// while no real device says otherwise.
-const DEVICE_DAMPING_N_S_PER_MM: f64 = 0.005;
+pub(crate) const DEVICE_DAMPING_N_S_PER_MM: f64 = 0.005;
 
 /// Width of an ultrasound probe's face, and radius of its curvature [mm]: a convex probe for the abdomen.
 const PROBE_WIDTH_MM: f64 = 60.0;
 const PROBE_FACE_MM: f64 = 60.0;
 
-/// Configuration of the tick, and whether the coupling's gains had to be lowered to stay passive; on a real device by its profile.
+/// Configuration of the tick, and whether the coupling's gains had to be lowered to stay passive; by the device's profile where there is one.
 pub(crate) fn config(scene: &Scene, tool: &Tool, device: Option<&DeviceProfile>) -> Result<(HapticConfig, bool), CouplingError> {
     let h = &scene.haptic;
     let period_s = 1.0 / h.rate_hz;

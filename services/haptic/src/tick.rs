@@ -1,13 +1,14 @@
 //! One tick of the loop: sample, compute, hand over. Bounded work, no allocation, nothing that waits.
 
 use crate::needle::{self, NeedleStage};
-use crate::{HapticError, breath::Breather, device, operator::Operator, outbox::Outbox, setup};
+use crate::operator::{Operator, simulated_profile};
+use crate::{HapticError, breath::Breather, device, outbox::Outbox, setup};
 use maille_breathing::Patient;
 use maille_contact::{DevicePose, HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
 use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
-use maille_scene::{BoxMm, Scene};
+use maille_scene::{BoxMm, Device, Scene};
 use maille_store::Reader;
 use maille_transport::{Domain, Life};
 use maille_volume::Sampler;
@@ -50,7 +51,13 @@ impl<'a> Loop<'a> {
     ) -> Result<Self, HapticError> {
         let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
         let real = device::kind(tool).map(|kind| device::options(scene).map(|options| (kind, options))).transpose()?;
-        let profile = real.as_ref().map(|(kind, options)| maille_device::profile(*kind, options));
+        let profile = match (&tool.device, &real) {
+            (_, Some((kind, options))) => Some(maille_device::profile(*kind, options)),
+            (Device::Sim, None) => Some(simulated_profile(&tool.hand, scene.haptic.max_force_n, scene.haptic.rate_hz)),
+            // its owner says what it is, or guards the port itself
+            (Device::External, None) => device::options(scene)?.profile,
+            _ => None,
+        };
         let (config, lowered) = setup::config(scene, tool, profile.as_ref()).map_err(|e| HapticError::Scene(e.to_string()))?;
         if lowered {
             eprintln!(
@@ -65,12 +72,18 @@ impl<'a> Loop<'a> {
             scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).map_err(|e| HapticError::Scene(e.to_string()))?;
         let way = way.ok_or(HapticError::NoTool)?;
         let real = real.map(|(kind, options)| device::open(kind, options, scene, &way)).transpose()?;
-        let needle = NeedleStage::new(domain, scene, &reader.info().grid, config.limits, profile.as_ref().map(|p| p.max_torque_n_mm))?;
+        let needle = NeedleStage::new(
+            domain,
+            scene,
+            &reader.info().grid,
+            config.limits,
+            real.as_ref().and(profile.as_ref()).map(|p| p.max_torque_n_mm),
+        )?;
         Ok(Self {
             reader,
             needle,
             core: HapticCore::new(config),
-            operator: Operator::new(tool, way, real),
+            operator: Operator::new(tool, scene.haptic.rate_hz, way, real),
             breather: patient.map(Breather::new),
             threshold_hu: scene.deformation.threshold_hu,
             view_seen: 0,

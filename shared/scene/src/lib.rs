@@ -12,6 +12,7 @@
 
 pub mod breathing;
 mod error;
+pub mod hand;
 pub mod limits;
 mod load;
 pub mod needle;
@@ -27,6 +28,7 @@ pub mod tool;
 
 pub use breathing::{Breathing, Signal};
 pub use error::SceneError;
+pub use hand::{GripKind, Hand};
 pub use load::TRANSFER_PRESETS;
 pub use needle::{Needle, NeedleTissue};
 pub use path::{BoxMm, ToolPose, Waypoint, Waypoints};
@@ -36,4 +38,4 @@ pub use resolve::View;
 pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
 pub use sections::{CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering};
 pub use tissue::Tissue;
-pub use tool::{Approach, Device, DeviceSection, Hand, PROFILES, PathPoint, RealDevice, Shape, Tool, ToolKind};
+pub use tool::{Approach, Device, DeviceSection, PROFILES, PathPoint, RealDevice, Shape, Tool, ToolKind};

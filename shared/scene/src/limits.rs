@@ -17,9 +17,9 @@ pub struct Limit {
 }
 
 macro_rules! limits {
-    ($($section:ident . $field:ident : $low:literal ..= $high:literal [$unit:literal] $get:expr;)*) => {
+    ($($section:ident $(. $field:ident)+ : $low:literal ..= $high:literal [$unit:literal] $get:expr;)*) => {
         &[$(Limit {
-            path: concat!(stringify!($section), ".", stringify!($field)),
+            path: concat!(stringify!($section) $(, ".", stringify!($field))+),
             unit: $unit,
             low: $low as f64,
             high: $high as f64,
@@ -35,6 +35,14 @@ pub static LIMITS: &[Limit] = limits! {
     tool.shaft_mm: 1 ..= 300 ["mm"] |s| s.tool.as_ref().map(|t| t.shaft_mm);
     tool.blade_mm: 1 ..= 100 ["mm"] |s| s.tool.as_ref().map(|t| t.blade_mm);
     tool.period_s: 0.1 ..= 3600 ["s"] |s| s.tool.as_ref().and_then(|t| t.period_s);
+    tool.hand.stiffness_n_per_mm: 0.01 ..= 10 ["N/mm"] |s| s.tool.as_ref().and_then(|t| t.hand.stiffness_n_per_mm);
+    tool.hand.damping_n_s_per_mm: 0 ..= 1 ["N·s/mm"] |s| s.tool.as_ref().and_then(|t| t.hand.damping_n_s_per_mm);
+    tool.hand.mass_kg: 0.01 ..= 5 ["kg"] |s| s.tool.as_ref().and_then(|t| t.hand.mass_kg);
+    tool.hand.tremor_mm: 0 ..= 2 ["mm"] |s| s.tool.as_ref().map(|t| t.hand.tremor_mm);
+    tool.hand.tremor_hz: 1 ..= 20 ["Hz"] |s| s.tool.as_ref().map(|t| t.hand.tremor_hz);
+    tool.hand.encoder_mm: 0 ..= 1 ["mm"] |s| s.tool.as_ref().map(|t| t.hand.encoder_mm);
+    tool.hand.delay_ms: 0 ..= 30 ["ms"] |s| s.tool.as_ref().map(|t| t.hand.delay_ms);
+    tool.hand.coulomb_n: 0 ..= 2 ["N"] |s| s.tool.as_ref().map(|t| t.hand.coulomb_n);
     needle.gauge: 14 ..= 25 [""] |s| Some(f64::from(s.needle.gauge));
     needle.length_mm: 20 ..= 300 ["mm"] |s| Some(s.needle.length_mm);
     needle.bending_n_mm2: 10 ..= 1000000 ["N·mm²"] |s| s.needle.bending_n_mm2;

@@ -362,9 +362,6 @@ fn check_direction(document: &Document, path: &str, v: Option<[f64; 3]>, faults:
 fn check_tool(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     let Some(tool) = &scene.tool else { return };
     check_path(document, "tool.path", &tool.path, faults);
-    check_range(document, "tool.hand.stiffness_n_per_mm", tool.hand.stiffness_n_per_mm, [0.01, 10.0], "N/mm", faults);
-    check_range(document, "tool.hand.damping_n_s_per_mm", tool.hand.damping_n_s_per_mm, [0.0, 1.0], "N·s/mm", faults);
-    check_range(document, "tool.hand.mass_kg", tool.hand.mass_kg, [0.01, 5.0], "kg", faults);
     for (key, approach) in [("approach", &tool.approach), ("elsewhere", &tool.elsewhere)] {
         if let Some(approach) = approach {
             check_approach(document, &format!("tool.{key}"), approach, faults);

@@ -4,6 +4,7 @@
 //! an LPS axis, 1 at the high end), so that one script serves volumes of any size. [`crate::path`] turns them into
 //! way points.
 
+use crate::hand::Hand;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -94,7 +95,8 @@ pub struct DeviceSection {
     /// touch: configuration name; inverse3: device id; by default the first
     #[serde(skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
-    /// what it can do, by name: Touch, omega, delta.3, sigma.7, Inverse3; by default the usual one of its kind
+    /// what it can do, by name: Touch, omega, delta.3, sigma.7, Inverse3; by default the usual one of its kind. For device `"external"`: with a
+    /// profile its limits hold and the passivity controller guards its port; without, only the scene's limits do
     #[serde(skip_serializing_if = "Option::is_none")]
     pub profile: Option<String>,
     /// where the device's origin lies [mm, LPS]; by default at the tool's first way point
@@ -239,23 +241,5 @@ pub struct Approach {
 impl Default for Approach {
     fn default() -> Self {
         Self { from: [0.5, 0.0, 0.5], toward: [0.5, 1.0, 0.5], press_mm: 6.0, hover_mm: 5.0, period_s: 4.0, lateral_mm: 0.0 }
-    }
-}
-
-/// `[tool.hand]`: a spring–damper hand that holds the tool, m a = k (x_hand − x) − b v + F.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Hand {
-    /// grip [N/mm], 0.01 to 10
-    pub stiffness_n_per_mm: f64,
-    /// damping [N·s/mm], 0 to 1
-    pub damping_n_s_per_mm: f64,
-    /// moving mass of hand and handle [kg], 0.01 to 5
-    pub mass_kg: f64,
-}
-
-impl Default for Hand {
-    fn default() -> Self {
-        Self { stiffness_n_per_mm: 0.6, damping_n_s_per_mm: 0.01, mass_kg: 0.1 }
     }
 }
