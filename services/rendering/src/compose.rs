@@ -3,10 +3,11 @@
 use crate::{overlay, view::View};
 use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
 use maille_raycast::{
-    Capsule, Extras, Geometry, Overlay, Picture, Plane, RenderError, Section, Skip, Ultrasound, Warp, render_extra, section_with,
-    ultrasound,
+    Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, render_extra,
+    section_with, ultrasound,
 };
 use maille_scene::Scene;
+use maille_transport::monotonic_ns;
 use maille_volume::BrickSource;
 
 /// Planes of views 1 to 3, in the order of [`maille_contract::messages::VIEWS`].
@@ -25,6 +26,12 @@ fn seen_from(capsule: &Capsule, eye: [f64; 3], least: f64) -> Capsule {
 pub(crate) struct Composer {
     skip: Option<Skip>,
     pictures: [Picture; 5],
+    /// how finely the next 3D view is drawn
+    pub quality: Quality,
+    /// room for a 3D view of fewer pixels
+    coarse: Picture,
+    /// time that the last 3D view took [ns]
+    pub view_ns: u64,
 }
 
 impl Composer {
@@ -33,7 +40,8 @@ impl Composer {
         let [sw, sh] = if scene.has_effect("sections") { scene.rendering.section_size } else { [0, 0] };
         let section = || Picture::new(sw, sh);
         let [fw, fh] = if scene.has_effect("ultrasound") { scene.rendering.section_size } else { [0, 0] };
-        Self { skip: None, pictures: [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)] }
+        let pictures = [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)];
+        Self { skip: None, pictures, quality: Quality::FULL, coarse: Picture::new(0, 0), view_ns: 0 }
     }
 
     /// Bytes of a frame.
@@ -53,7 +61,11 @@ impl Composer {
         needle: Option<&[Capsule]>,
     ) -> Result<(), RenderError> {
         let (camera, at_tip) = view.camera(tool);
-        let settings = view.settings(at_tip);
+        let mut settings = view.settings(at_tip);
+        settings.step = match settings.step {
+            Step::Millimetres(mm) => Step::Millimetres(mm * self.quality.step),
+            Step::Voxels(n) => Step::Voxels(n * self.quality.step),
+        };
         let skip = match &mut self.skip {
             Some(skip) => {
                 skip.update(source, &settings);
@@ -65,13 +77,22 @@ impl Composer {
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
         let bodies = Geometry { capsules, meshes: &[] };
+        let [w, h] = [whole.width, whole.height].map(|n| self.quality.pixels(n));
         // what is thinner than a pixel would be dots where it meets the middles of pixels
-        let pixel = 2.0 * (camera.fov_deg.to_radians() / 2.0).tan() / whole.height.max(1) as f64;
+        let pixel = 2.0 * (camera.fov_deg.to_radians() / 2.0).tan() / h as f64;
         let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
         let in_3d = Geometry { capsules: &thick, meshes: &[] };
         // an endoscope does not see itself
         let extras = Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), ..Extras::default() };
-        render_extra(&extras, source, skip, &camera, &settings, whole)?;
+        let start = monotonic_ns();
+        if [w, h] == [whole.width, whole.height] {
+            render_extra(&extras, source, skip, &camera, &settings, whole)?;
+        } else {
+            self.coarse.resize(w, h);
+            render_extra(&extras, source, skip, &camera, &settings, &mut self.coarse)?;
+            enlarge(&self.coarse, whole);
+        }
+        self.view_ns = monotonic_ns() - start;
         let [level, window] = view.window_hu();
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
@@ -102,9 +123,43 @@ impl Composer {
     }
 }
 
+/// A picture with more pixels, linear between those that there are.
+fn enlarge(from: &Picture, to: &mut Picture) {
+    let place = |n: usize, of: usize, count: usize| {
+        let at = ((n as f32 + 0.5) * count as f32 / of as f32 - 0.5).max(0.0);
+        let cell = (at as usize).min(count - 1);
+        (cell, (cell + 1).min(count - 1), ((at - cell as f32) * 256.0) as u32)
+    };
+    let across: Vec<_> = (0..to.width).map(|x| place(x, to.width, from.width)).collect();
+    for (y, row) in to.rgb.chunks_exact_mut(3 * to.width).enumerate() {
+        let (top, bottom, t) = place(y, to.height, from.height);
+        for (pixel, &(left, right, s)) in row.chunks_exact_mut(3).zip(&across) {
+            for (c, byte) in pixel.iter_mut().enumerate() {
+                let at = |x: usize, y: usize| u32::from(from.rgb[3 * (y * from.width + x) + c]);
+                let mix = |y: usize| at(left, y) * (256 - s) + at(right, y) * s;
+                *byte = ((mix(top) * (256 - t) + mix(bottom) * t + (1 << 15)) >> 16) as u8;
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_picture_made_larger_keeps_its_colours_and_their_order() {
+        let mut small = Picture::new(2, 2);
+        small.rgb.copy_from_slice(&[0, 10, 255, 100, 10, 255, 200, 10, 255, 40, 10, 255]);
+        let mut large = Picture::new(8, 6);
+        enlarge(&small, &mut large);
+        assert!((0..48).all(|n| large.rgb[3 * n + 1] == 10 && large.rgb[3 * n + 2] == 255));
+        assert_eq!([(0, 0), (7, 0), (0, 5), (7, 5)].map(|(x, y)| large.pixel(x, y)[0]), [0, 100, 200, 40]);
+        assert!((0..7).all(|x| large.pixel(x, 0)[0] <= large.pixel(x + 1, 0)[0]));
+        let mut same = Picture::new(2, 2);
+        enlarge(&small, &mut same);
+        assert_eq!(same, small);
+    }
 
     #[test]
     fn a_thin_body_far_away_is_drawn_a_pixel_wide_and_a_thick_one_as_it_is() {

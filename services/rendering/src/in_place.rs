@@ -7,6 +7,7 @@
 
 use crate::{compose::Composer, view::View};
 use maille_contract::Role;
+use maille_raycast::Quality;
 use maille_scene::{BoxMm, Scene};
 use maille_store::{Reader, StoreKeeper, StoreSizes, Writer};
 use maille_transport::{ControlMap, Domain};
@@ -194,4 +195,26 @@ fn what_is_drawn_are_the_bytes_in_the_segment_now() {
         }
         assert!(world.draw(&mut composer, &snapshot) != before, "{segment}: the picture is made of other bytes than those that lie there");
     }
+}
+
+#[test]
+fn a_frame_at_rest_is_whole_whatever_was_drawn_before_and_a_moving_one_is_coarser() {
+    let world = World::new();
+    let snapshot = world.reader.snapshot();
+    let whole = world.draw(&mut Composer::new(&world.scene), &snapshot);
+    let mut composer = Composer::new(&world.scene);
+    let mut differs = Vec::new();
+    for quality in [Quality { scale: 0.8, step: 1.0 }, Quality { scale: 0.5, step: 1.5 }, Quality { scale: 0.25, step: 2.0 }] {
+        composer.quality = quality;
+        let coarse = world.draw(&mut composer, &snapshot);
+        assert_eq!(coarse.len(), whole.len());
+        let view = 3 * world.scene.rendering.size.iter().product::<usize>();
+        assert!(coarse[view..] == whole[view..], "sections stay as they are");
+        let mean = whole.iter().zip(&coarse).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / view as f64;
+        differs.push(mean);
+        composer.quality = Quality::FULL;
+        assert!(world.draw(&mut composer, &snapshot) == whole, "after {quality:?} the picture at rest is another one");
+    }
+    println!("mean difference of coarser pictures: {differs:.2?} of 255");
+    assert!(differs.windows(2).all(|w| 0.0 < w[0] && w[0] < w[1]) && differs[2] < 12.0, "coarser, and still the same patient: {differs:?}");
 }

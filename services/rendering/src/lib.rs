@@ -2,8 +2,9 @@
 //!
 //! At the scene's rate it looks whether anything that is seen has changed (epoch, view, tool); if so it pins a snapshot, brings
 //! the map of empty space up to date for the bricks whose versions changed, draws the views and publishes them as one
-//! loaned sample. The pin is held for one frame. When nothing changes a frame goes out twice a second, so that a page
-//! that joins sees something. A patient who breathes is drawn through the warp of the frame's simulation time ([`breath`]).
+//! loaned sample. The pin is held for one frame. While something changes, pixels and step of the 3D view hold the scene's rate
+//! ([`FrameBudget`], unless the scene says `adapt = false`); once nothing does, it is drawn whole, and what then stands goes out again twice
+//! a second, so that a page that joins sees something. A patient who breathes is drawn through the warp of the frame's simulation time ([`breath`]).
 
 #![forbid(unsafe_code)]
 
@@ -16,10 +17,11 @@ mod overlay;
 mod view;
 
 use maille_contract::needle::NeedleState;
-use maille_contract::{FrameHeader, Role, ToolState, control::Counter};
+use maille_contract::{FrameHeader, Role, ServiceCell, ToolState, control::Counter};
+use maille_raycast::{FrameBudget, Quality};
 use maille_scene::{BoxMm, Machine, Scene};
 use maille_store::Reader;
-use maille_transport::{Domain, Life, Node, monotonic_ns};
+use maille_transport::{Domain, FramePublisher, Life, Node, monotonic_ns};
 use std::time::Duration;
 use thiserror::Error;
 
@@ -71,7 +73,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
-    let mut shown = None;
+    let mut budget = FrameBudget::new(period_ns as f64 * 1e-6);
+    let (mut shown, mut header) = (None, FrameHeader::default());
     let has_needle = scene.has_effect("needle");
     let mut bodies = Vec::new();
     loop {
@@ -98,10 +101,20 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         let needle = if has_needle { life.control().needle.load::<NeedleState>().map(|(needle, _)| needle) } else { None };
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
         let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
-        if shown == Some(seen) && now - last_sent_ns < STILL_NS {
-            continue;
-        }
+        let moving = shown != Some(seen);
         shown = Some(seen);
+        let quality = if scene.rendering.adapt { budget.next(moving) } else { moving.then_some(Quality::FULL) };
+        let Some(quality) = quality else {
+            // what stands goes out again, for who has just come to look
+            if sent > 0 && now - last_sent_ns >= STILL_NS {
+                sent += 1;
+                header.stamp = life.stamp(sent);
+                send(&frames, &composer, header, life.cell());
+                last_sent_ns = now;
+            }
+            continue;
+        };
+        composer.quality = quality;
         let snapshot = reader.snapshot();
         if let Some(needle) = &needle {
             let to_world = |at| breather.as_ref().map_or(at, |breather| breather.to_world(time_ns, at));
@@ -115,29 +128,44 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         let epoch = snapshot.epoch();
         drop(snapshot);
         if let Err(reason) = drawn {
-            // a view that cannot be drawn (a camera that looks nowhere) leaves the last picture standing
-            view.fall_back(&reason.to_string());
+            // a view that cannot be drawn (a camera that looks nowhere) leaves the last picture standing until the scene's view is drawn
+            if view.fall_back(&reason.to_string()) {
+                shown = None;
+            }
             life.cell().count(Counter::Refused, 1);
             continue;
         }
+        budget.drawn(composer.view_ns as f64 * 1e-6);
+        // the 3D view has what sections, warp and the map of empty space leave of the period, a quarter of it at least
+        let others_ns = render_ns.saturating_sub(composer.view_ns);
+        budget.allow(period_ns.saturating_sub(others_ns).max(period_ns / 4) as f64 * 1e-6);
         sent += 1;
         let stamp = life.stamp(sent);
-        let bytes = composer.bytes();
-        let header = FrameHeader { stamp, epoch, view_sequence: view.sequence(), render_ns, shown_ns: time_ns, ..FrameHeader::default() };
-        match frames.send(bytes, |pixels| composer.write(pixels, header)) {
-            Ok(()) => {
-                life.cell().count(Counter::Sent, 1);
-                life.cell().count(Counter::BytesSent, bytes as u64);
-            }
-            // every sample is held by readers: this frame is dropped, the next will do
-            Err(_) => life.cell().count(Counter::Deferred, 1),
-        }
+        header = FrameHeader { stamp, epoch, view_sequence: view.sequence(), render_ns, shown_ns: time_ns, ..FrameHeader::default() };
+        send(&frames, &composer, header, life.cell());
         last_sent_ns = now;
-        if life.record(now, monotonic_ns() - now, None)
-            && let Some((off_mm, unsettled)) = breather.as_ref().map(breath::Breather::report)
-        {
+        if !life.record(now, monotonic_ns() - now, None) {
+            continue;
+        }
+        if quality != Quality::FULL {
+            life.cell().count(Counter::Coarse, 1);
+        }
+        if let Some((off_mm, unsettled)) = breather.as_ref().map(breath::Breather::report) {
             life.control().warp.record((off_mm * 1e6) as u64);
             life.cell().count(Counter::Failures, unsettled);
         }
+    }
+}
+
+/// Hands the pictures over as they are.
+fn send(frames: &FramePublisher, composer: &compose::Composer, header: FrameHeader, cell: &ServiceCell) {
+    let bytes = composer.bytes();
+    match frames.send(bytes, |pixels| composer.write(pixels, header)) {
+        Ok(()) => {
+            cell.count(Counter::Sent, 1);
+            cell.count(Counter::BytesSent, bytes as u64);
+        }
+        // every sample is held by readers: this frame is dropped, the next will do
+        Err(_) => cell.count(Counter::Deferred, 1),
     }
 }

@@ -64,10 +64,10 @@ impl View {
         self.page.map_or(0, |p| p.stamp.sequence)
     }
 
-    /// Forgets a view that could not be drawn.
-    pub fn fall_back(&mut self, reason: &str) {
+    /// Forgets a view of the page that could not be drawn; false where it was the scene's own.
+    pub fn fall_back(&mut self, reason: &str) -> bool {
         eprintln!("maille-rendering: the view was refused ({reason}); back to the scene's");
-        self.page = None;
+        self.page.take().is_some()
     }
 
     fn through_endoscope(&self) -> bool {

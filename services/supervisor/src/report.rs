@@ -24,6 +24,7 @@
 //! | `services.deformation.step_us` | from a tool move to its commit |
 //! | `services.deformation.tool_moves`, `deferred`, `refused`, `inversion_failures` | moves received; commits put off for want of a slot; messages that could not be used; voxels given their nearest answer |
 //! | `services.rendering.frames`, `rate_hz`, `frame_ms` | frames after warm-up; a second; time of one |
+//! | `services.rendering.coarse_frames` | frames whose 3D view was drawn more coarsely than the scene asks for, to be in time |
 //! | `services.rendering.warp` | in a scene that breathes: `unsettled` nodes of all frames' warps, `error_mm`, how far from its place anything in a frame may be drawn: `p50`, `p99`, `p999`, `max` |
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
@@ -134,6 +135,7 @@ pub struct RenderingReport {
     pub frames: u64,
     pub rate_hz: f64,
     pub frame_ms: Durations,
+    pub coarse_frames: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub warp: Option<WarpReport>,
 }
@@ -245,6 +247,7 @@ fn own(role: Role, control: &ControlBlock) -> Own {
             frames: n(Counter::Iterations),
             rate_hz,
             frame_ms: Durations::of(&cell.duration, 1e6),
+            coarse_frames: n(Counter::Coarse),
             warp: breathes(&control.warp, 0)
                 .map(|_| WarpReport { unsettled: n(Counter::Failures), error_mm: Durations::of(&control.warp, 1e6) }),
         }),
@@ -287,7 +290,7 @@ impl fmt::Display for RunReport {
                     let rate = format!("{:.1}", d.commits as f64 / self.duration_s.max(1e-9));
                     (rate, format!("{} commits, {} elements moved", d.commits, d.moved_elements))
                 }
-                Own::Rendering(r) => (format!("{:.1}", r.rate_hz), format!("{} frames", r.frames)),
+                Own::Rendering(r) => (format!("{:.1}", r.rate_hz), format!("{} frames, {} of them coarse", r.frames, r.coarse_frames)),
                 Own::Console {} => Default::default(),
             };
             let killed = if s.killed { ", had to be killed" } else { "" };

@@ -242,6 +242,8 @@ fn scene_of(base: &Scene, effects: &BTreeSet<&str>) -> Scene {
         prepare(&mut scene, name);
     }
     scene.console.enabled = false;
+    // one quality for all: what an effect adds to a frame is not to be hidden by drawing less
+    scene.rendering.adapt = false;
     scene
 }
 

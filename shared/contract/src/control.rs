@@ -113,6 +113,8 @@ pub enum Counter {
     TissueStands = 15,
     /// ticks in which no rest position was found for the device: the last one is kept and the force fades (haptic)
     Unmapped = 16,
+    /// frames whose 3D view was drawn more coarsely than the scene asks for, to be in time (rendering)
+    Coarse = 17,
 }
 
 /// Number of counters.

@@ -2,10 +2,12 @@
 //!
 //! A frame costs about k · scale² / step, scale being the share of the full width and height that is drawn, step the distance
 //! between samples over the one asked for. k is followed from the frames that were drawn. While things move, step and scale
-//! share what must be saved (a coarser step up to [`LONGEST_STEP`] first hurts less than fewer pixels); once they rest, the
-//! next picture is whole at the step asked for, and the one after that at half of it.
+//! share what must be saved (a coarser step up to [`LONGEST_STEP`] first hurts less than fewer pixels). Once they have rested for
+//! [`REST`] frames the picture is drawn whole at the step asked for, unless the last one was; then nothing is to be drawn.
 //!
-//! Pure: times come in, quality goes out. Invariants: scale in [`SMALLEST_SCALE`]…1, step in ½…[`LONGEST_STEP`].
+//! Somebody who knows of other loads may hold everything below a quality of its own ([`FrameBudget::hold`]), pictures at rest too.
+//!
+//! Pure: times come in, quality goes out. Invariants: scale in [`SMALLEST_SCALE`]…1, step in 1…[`LONGEST_STEP`], unless held coarser.
 
 /// Fewest pixels an axis while things move.
 pub const SMALLEST_SCALE: f64 = 0.25;
@@ -17,6 +19,8 @@ const PLANNED: f64 = 0.85;
 const FOLLOW: f64 = 0.4;
 /// Changes of scale below this are not worth their flicker.
 const STEADY: f64 = 0.06;
+/// Frames without motion before the picture is refined: a hand that pauses is not made to wait for a fine picture.
+pub const REST: u32 = 3;
 
 /// What to draw.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,6 +34,17 @@ pub struct Quality {
 impl Quality {
     /// Whole pictures at the step asked for.
     pub const FULL: Self = Self { scale: 1.0, step: 1.0 };
+
+    /// The coarser of both, in each way.
+    #[must_use]
+    pub fn coarser(self, other: Self) -> Self {
+        Self { scale: self.scale.min(other.scale), step: self.step.max(other.step) }
+    }
+
+    /// Pixels of a picture that is this fine.
+    pub fn pixels(self, full: usize) -> usize {
+        ((full as f64 * self.scale).round() as usize).clamp(1, full.max(1))
+    }
 }
 
 /// Follows the time of frames.
@@ -39,6 +54,8 @@ pub struct FrameBudget {
     /// time of a frame of full quality [ms], as far as it is known
     full_ms: Option<f64>,
     last: Quality,
+    /// nothing is drawn finer
+    held: Quality,
     /// frames since anything moved
     rested: u32,
 }
@@ -46,13 +63,20 @@ pub struct FrameBudget {
 impl FrameBudget {
     /// For frames every `frame_ms` milliseconds.
     pub fn new(frame_ms: f64) -> Self {
-        Self { frame_ms: frame_ms.max(1e-3), full_ms: None, last: Quality::FULL, rested: 0 }
+        Self { frame_ms: frame_ms.max(1e-3), full_ms: None, last: Quality::FULL, held: Quality::FULL, rested: 0 }
     }
 
     /// Changes the time that there is for a frame [ms]: what everything else leaves.
     pub fn allow(&mut self, frame_ms: f64) {
         if frame_ms.is_finite() {
             self.frame_ms = frame_ms.max(1e-3);
+        }
+    }
+
+    /// Draws nothing finer than this from now on; [`Quality::FULL`] lets go. Numbers that are no quality are ignored.
+    pub fn hold(&mut self, finest: Quality) {
+        if finest.scale > 0.0 && finest.step.is_finite() {
+            self.held = Quality::FULL.coarser(finest);
         }
     }
 
@@ -65,20 +89,22 @@ impl FrameBudget {
         self.full_ms = Some(self.full_ms.map_or(full, |known| known + FOLLOW * (full - known)));
     }
 
-    /// Quality of the next frame.
-    pub fn next(&mut self, moving: bool) -> Quality {
+    /// Quality of the next frame; none while the picture that stands will do, or not yet.
+    pub fn next(&mut self, moving: bool) -> Option<Quality> {
         self.rested = if moving { 0 } else { self.rested.saturating_add(1) };
-        self.last = match self.rested {
-            0 => self.moving(),
-            1 => Quality::FULL,
-            _ => Quality { scale: 1.0, step: 0.5 },
+        let next = match self.rested {
+            0 => self.moving().coarser(self.held),
+            1..REST => return None,
+            _ if self.settled() => return None,
+            _ => self.held,
         };
-        self.last
+        self.last = next;
+        Some(next)
     }
 
-    /// Whether the picture that rests is as fine as it gets.
+    /// Whether the picture that stands, drawn by the quality given out last, is as fine as it gets.
     pub fn settled(&self) -> bool {
-        self.rested >= 2
+        self.last == self.held
     }
 
     fn moving(&self) -> Quality {
@@ -101,12 +127,17 @@ mod tests {
     fn run(full: f64, frames: usize, budget: &mut FrameBudget) -> (Quality, f64) {
         let mut seen = (Quality::FULL, 0.0);
         for _ in 0..frames {
-            let q = budget.next(true);
+            let q = budget.next(true).expect("what moves is drawn");
             let ms = full * q.scale * q.scale / q.step;
             budget.drawn(ms);
             seen = (q, ms);
         }
         seen
+    }
+
+    /// What is drawn in as many frames without motion.
+    fn rest(frames: u32, budget: &mut FrameBudget) -> Vec<Quality> {
+        (0..frames).filter_map(|_| budget.next(false)).collect()
     }
 
     #[test]
@@ -120,15 +151,32 @@ mod tests {
     }
 
     #[test]
-    fn what_rests_becomes_whole_and_then_finer() {
+    fn what_rests_becomes_whole_once_and_not_before_it_rests() {
         let mut budget = FrameBudget::new(33.0);
         run(200.0, 8, &mut budget);
-        assert_eq!(budget.next(false), Quality::FULL);
         assert!(!budget.settled());
-        assert_eq!(budget.next(false), Quality { scale: 1.0, step: 0.5 });
+        assert_eq!(rest(REST - 1, &mut budget), []);
+        assert_eq!(rest(50, &mut budget), [Quality::FULL]);
         assert!(budget.settled());
-        let moving = budget.next(true);
+        let moving = budget.next(true).unwrap();
         assert!(moving.scale < 1.0 && moving.step > 1.0 && !budget.settled());
+        // a whole picture that stands is not drawn again
+        let mut quick = FrameBudget::new(33.0);
+        run(5.0, 8, &mut quick);
+        assert_eq!(rest(50, &mut quick), []);
+    }
+
+    #[test]
+    fn what_is_held_stays_coarse_at_rest_too_until_it_is_let_go() {
+        let mut budget = FrameBudget::new(33.0);
+        let held = Quality { scale: 0.5, step: 1.5 };
+        budget.hold(held);
+        assert_eq!(run(5.0, 4, &mut budget).0, held);
+        assert_eq!(rest(50, &mut budget), []);
+        budget.hold(Quality { scale: f64::NAN, step: 1.0 });
+        assert!(budget.settled());
+        budget.hold(Quality::FULL);
+        assert_eq!(rest(50, &mut budget), [Quality::FULL]);
     }
 
     #[test]
@@ -150,11 +198,11 @@ mod tests {
     fn the_picture_does_not_flicker() {
         let mut budget = FrameBudget::new(33.0);
         run(150.0, 10, &mut budget);
-        let first = budget.next(true);
+        let first = budget.next(true).unwrap();
         for n in 0..20 {
             // frames that differ by a twentieth
             budget.drawn(150.0 * (1.0 + 0.05 * f64::from(n % 3 - 1)) * first.scale * first.scale / first.step);
-            assert_eq!(budget.next(true), first);
+            assert_eq!(budget.next(true), Some(first));
         }
     }
 }

@@ -213,6 +213,8 @@ pub struct Rendering {
     pub distance: f64,
     /// sampling step along the ray, in units of the smallest spacing, 0.05 to 4 (a knob)
     pub step: f64,
+    /// while things move, draw the 3D view with fewer pixels and longer steps where that is needed to hold `rate_hz`; at rest it is whole
+    pub adapt: bool,
     /// gradient shading
     pub shading: bool,
     /// a ray ends when this part of the light is used up, 0.5 to 1 (a knob)
@@ -242,6 +244,7 @@ impl Default for Rendering {
             look_at: [0.5, 0.5, 0.5],
             distance: 0.75,
             step: 1.0,
+            adapt: true,
             shading: true,
             opacity_end: 0.99,
             section_window_hu: [50.0, 800.0],
