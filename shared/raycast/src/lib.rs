@@ -16,6 +16,7 @@
 
 #![deny(unsafe_code)]
 
+mod beam;
 pub mod budget;
 pub mod camera;
 mod frame;
@@ -25,6 +26,7 @@ mod geometry_tests;
 pub mod labels;
 mod lanes;
 mod outline;
+mod overlay;
 mod packet;
 pub mod picture;
 mod raster;
@@ -45,6 +47,7 @@ pub use budget::{FrameBudget, Quality};
 pub use camera::Camera;
 pub use geometry::{Capsule, Geometry, MeshView, carry, vertex_normals};
 pub use labels::Labels;
+pub use overlay::tint_displacement;
 pub use picture::Picture;
 pub use render::{Extras, Kernel, RenderError, render, render_extra, render_with};
 pub use section::{Overlay, Plane, Section, SlabMode, section, section_with};

@@ -35,12 +35,13 @@ pub fn widest() -> Width {
     Width::Portable
 }
 
-/// Casts the rays of a tile; a width that this processor has not is taken for [`Width::Portable`].
+/// Casts the rays of a tile, in which nothing is to be seen nearer than `clear` [mm]; a width that this processor has not is taken for [`Width::Portable`].
 pub fn cast_tile<S: BrickSource + ?Sized>(
     width: Width,
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
     mut warp: Option<&mut Tile<'_>>,
+    clear: f32,
     first: [usize; 2],
     size: [usize; 2],
     put: impl FnMut(usize, usize, Seen),
@@ -53,7 +54,7 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
         {
             return tile(lanes, first, size, put, |l, x, y| {
                 // SAFETY: `lanes` is the proof that this processor has the instructions.
-                unsafe { cast_avx512(l, stage, ends, warp.as_deref_mut(), x, y) }
+                unsafe { cast_avx512(l, stage, ends, warp.as_deref_mut(), clear, x, y) }
             });
         }
         if width == Width::Avx2
@@ -61,12 +62,12 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
         {
             return tile(lanes, first, size, put, |l, x, y| {
                 // SAFETY: `lanes` is the proof that this processor has the instructions.
-                unsafe { cast_avx2(l, stage, ends, warp.as_deref_mut(), x, y) }
+                unsafe { cast_avx2(l, stage, ends, warp.as_deref_mut(), clear, x, y) }
             });
         }
     }
     let _ = width;
-    tile(crate::lanes::portable::Portable, first, size, put, |l, x, y| walk::cast(l, stage, ends, warp.as_deref_mut(), x, y));
+    tile(crate::lanes::portable::Portable, first, size, put, |l, x, y| walk::cast(l, stage, ends, warp.as_deref_mut(), clear, x, y));
 }
 
 fn tile<L: Lanes>(
@@ -96,10 +97,11 @@ fn cast_avx512<S: BrickSource + ?Sized>(
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
     warp: Option<&mut Tile<'_>>,
+    clear: f32,
     x: usize,
     y: usize,
 ) -> walk::Packet {
-    walk::cast(l, stage, ends, warp, x, y)
+    walk::cast(l, stage, ends, warp, clear, x, y)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -109,8 +111,9 @@ fn cast_avx2<S: BrickSource + ?Sized>(
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
     warp: Option<&mut Tile<'_>>,
+    clear: f32,
     x: usize,
     y: usize,
 ) -> walk::Packet {
-    walk::cast(l, stage, ends, warp, x, y)
+    walk::cast(l, stage, ends, warp, clear, x, y)
 }

@@ -1,6 +1,7 @@
 //! A picture: bands of rows over the threads, tiles within a band, one kernel chosen at run time.
 
 use crate::{
+    beam,
     camera::Camera,
     frame::Frame,
     geometry::Geometry,
@@ -183,7 +184,11 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                 }
             };
             match lanes {
-                Some(lanes) => packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), [x0, n * BAND], [columns, rows], put),
+                Some(lanes) => {
+                    let (first, size) = ([x0, n * BAND], [columns, rows]);
+                    let clear = if tile.is_none() { beam::clear(&frame, skip, first, size) } else { 0.0 };
+                    packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), clear, first, size, put);
+                }
                 None => (n * BAND..n * BAND + rows).for_each(|y| {
                     (x0..x0 + columns).for_each(|x| {
                         let end = solid.as_ref().map_or(f32::INFINITY, |band| band.depth[(y - n * BAND) * width + x]);

@@ -6,7 +6,8 @@
 
 use crate::{
     geometry::Geometry,
-    labels::{Labels, hsv},
+    labels::Labels,
+    overlay::{color, tint},
     picture::Picture,
     warp::Warp,
 };
@@ -166,11 +167,6 @@ pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, ove
         (count > 0.0).then_some(if section.slab_mode == SlabMode::Mean { sum / count } else { most })
     };
     let gain = 255.0 / section.window.max(1e-9);
-    let tint = |color: [f32; 3], share: f32, pixel: &mut [u8]| {
-        for (byte, c) in pixel.iter_mut().zip(color) {
-            *byte = (f32::from(*byte) + (255.0 * c - f32::from(*byte)) * share.clamp(0.0, 1.0) + 0.5) as u8;
-        }
-    };
     picture.rgb.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
             let at = section.position(x as f64, y as f64, width, height);
@@ -185,9 +181,8 @@ pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, ove
             }
             if let (Some(_), Some(opaque_mm)) = (warp, overlay.displacement_mm) {
                 let u = Vector3::from(at) - Vector3::from(grid.world_from_index(rest(at)));
-                let (across, up) = (u.dot(&right), -u.dot(&down));
-                let color = hsv((up.atan2(across) / std::f64::consts::TAU) as f32, 1.0, 1.0);
-                tint(color, (across.hypot(up) / opaque_mm.max(1e-9)) as f32, pixel);
+                let (color, share) = color(u.dot(&right), -u.dot(&down), opaque_mm);
+                tint(color, share, pixel);
             }
         }
     });

@@ -371,9 +371,16 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
         (unsafe { l.bytes(distances, number) }, corner)
     }
 
-    /// Walks to the end.
+    /// The first piece, of one step each, whose sample lies beyond a distance from the eye [mm].
     #[inline(always)]
-    fn walk(&mut self) -> Packet {
+    fn first(&self, clear: f32) -> L::Float {
+        let l = self.l;
+        ((l.set(clear) - self.rays.start) * l.set(1.0 / self.frame.step) - l.set(0.5 + 1e-3)).ceil().max(l.set(0.0))
+    }
+
+    /// Walks to the end; nothing is to be seen nearer than `clear` [mm].
+    #[inline(always)]
+    fn walk(&mut self, clear: f32) -> Packet {
         let (l, frame, adaptive) = (self.l, self.frame, self.frame.adaptive);
         let (distances, counts) = self.stage.skip.distances();
         let large = distances.len() > EXACT;
@@ -385,10 +392,12 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
         let mut attenuation = zero;
         let [mut diffuse, mut specular] = [one, zero];
         // the piece of ray that comes next, and whether diffuse and specular are of this stretch of matter
-        let (mut from, mut long) = (zero, one);
+        let (mut from, mut long) = (self.first(clear), one);
         let mut shaded = none;
         // lanes that the warp had out of the volume a moment ago
         let mut edge = none;
+        // a surface's hits: found one by one, looked at together
+        let (mut met, mut met_at, mut met_value, mut met_fresh) = (none, zero, zero, none);
         let mut alive = l.set(if self.ends { 0.0 } else { 0.5 }).lt(self.rays.length);
         while alive.any() {
             if self.ends {
@@ -489,18 +498,12 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
                         alive = alive & !hit;
                     }
                 }
-                Mode::Isosurface { color: surface, .. } => {
+                Mode::Isosurface { .. } => {
                     next = next.or(here, from + one);
                     let hit = here & value.ge(l.set(frame.threshold));
-                    if hit.any() {
-                        let (at, factors) = self.surface(q, hit, value, fresh);
-                        for c in 0..3 {
-                            color[c] = color[c] + l.set(surface[c]).fma(factors[0], factors[1]).only(hit);
-                        }
-                        depth = depth.or(hit, at);
-                        transmittance = zero.or(!hit, transmittance);
-                        alive = alive & !hit;
-                    }
+                    (met_at, met_value) = (met_at.or(hit, q), met_value.or(hit, value));
+                    (met, met_fresh) = (met | hit, met_fresh | (hit & fresh));
+                    alive = alive & !hit;
                 }
                 Mode::Xray { water_per_mm } => {
                     next = next.or(here, from + one);
@@ -509,6 +512,16 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
                 }
             }
             from = next;
+        }
+        if let Mode::Isosurface { color: surface, .. } = frame.mode
+            && met.any()
+        {
+            let (at, factors) = self.surface(met_at, met, met_value, met_fresh);
+            for c in 0..3 {
+                color[c] = l.set(surface[c]).fma(factors[0], factors[1]).only(met);
+            }
+            depth = depth.or(met, at);
+            transmittance = zero.or(!met, transmittance);
         }
         let mut seen = Packet { color: axes!(c => floats(l, color[c])), transmittance: floats(l, transmittance), depth: floats(l, depth) };
         match frame.mode {
@@ -597,13 +610,14 @@ impl Packet {
     }
 }
 
-/// Walks the rays through a packet of pixels whose first is (x, y).
+/// Walks the rays through a packet of pixels whose first is (x, y); nothing is to be seen nearer than `clear` [mm].
 #[inline(always)]
 pub fn cast<L: Lanes, S: BrickSource + ?Sized>(
     l: L,
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
     tile: Option<&mut Tile<'_>>,
+    clear: f32,
     x: usize,
     y: usize,
 ) -> Packet {
@@ -613,5 +627,5 @@ pub fn cast<L: Lanes, S: BrickSource + ?Sized>(
     let bend = tile.map(|tile| Bend::new(l, frame, tile, [x, y], rays.start, rays.delta));
     let inverse = axes!(c => l.set(1.0) / rays.delta[c]);
     let mut walker = Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] };
-    walker.walk()
+    walker.walk(clear)
 }
