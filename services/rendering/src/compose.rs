@@ -1,10 +1,9 @@
 //! A frame: the views drawn, then laid side by side in one sample.
 
-use crate::{overlay, view::View};
+use crate::{backend::Backend, overlay, view::View};
 use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
 use maille_raycast::{
-    Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, render_extra,
-    section_with, ultrasound,
+    Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, ultrasound,
 };
 use maille_scene::Scene;
 use maille_transport::monotonic_ns;
@@ -28,6 +27,8 @@ pub(crate) struct Composer {
     pictures: [Picture; 5],
     /// how finely the next 3D view is drawn
     pub quality: Quality,
+    /// who draws
+    pub backend: Backend,
     /// room for a 3D view of fewer pixels
     coarse: Picture,
     /// time that the last 3D view took [ns]
@@ -41,7 +42,7 @@ impl Composer {
         let section = || Picture::new(sw, sh);
         let [fw, fh] = if scene.has_effect("ultrasound") { scene.rendering.section_size } else { [0, 0] };
         let pictures = [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)];
-        Self { skip: None, pictures, quality: Quality::FULL, coarse: Picture::new(0, 0), view_ns: 0 }
+        Self { skip: None, pictures, quality: Quality::FULL, backend: Backend::default(), coarse: Picture::new(0, 0), view_ns: 0 }
     }
 
     /// Bytes of a frame.
@@ -73,6 +74,7 @@ impl Composer {
             }
             empty => empty.insert(Skip::new(source, &settings)),
         };
+        self.backend.begin();
         let [whole, sections @ .., fan] = &mut self.pictures;
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
@@ -83,13 +85,13 @@ impl Composer {
         let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
         let in_3d = Geometry { capsules: &thick, meshes: &[] };
         // an endoscope does not see itself
-        let extras = Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), ..Extras::default() };
+        let extras = Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), barrel: view.barrel(at_tip), ..Extras::default() };
         let start = monotonic_ns();
         if [w, h] == [whole.width, whole.height] {
-            render_extra(&extras, source, skip, &camera, &settings, whole)?;
+            self.backend.render(&extras, source, skip, &camera, &settings, whole)?;
         } else {
             self.coarse.resize(w, h);
-            render_extra(&extras, source, skip, &camera, &settings, &mut self.coarse)?;
+            self.backend.render(&extras, source, skip, &camera, &settings, &mut self.coarse)?;
             enlarge(&self.coarse, whole);
         }
         self.view_ns = monotonic_ns() - start;
@@ -98,7 +100,7 @@ impl Composer {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
             let overlay = Overlay { warp, geometry: Some(&bodies), ..Overlay::default() };
-            section_with(source, &Section { level, window, ..whole }, &overlay, picture);
+            self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
         if fan.width > 0 {
             let drawn = tool.is_some_and(|tool| ultrasound(source, &Ultrasound::new(overlay::probe(tool)), warp, fan).is_ok());

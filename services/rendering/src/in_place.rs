@@ -14,7 +14,10 @@ use maille_transport::{ControlMap, Domain};
 use maille_volume::{Brick, BrickId, BrickLayout, BrickSource, Grid, Rescale, Volume, VolumeInfo};
 use std::{
     ops::Range,
-    sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed},
+    },
 };
 
 /// A source that notes where its bricks lie.
@@ -83,17 +86,18 @@ impl<S: BrickSource> BrickSource for Copies<'_, S> {
     }
 }
 
-struct World {
+/// A patient in a store of its own.
+pub(crate) struct World {
     domain: Domain,
     _control: ControlMap,
     _keeper: StoreKeeper,
-    reader: Reader,
-    scene: Scene,
+    pub reader: Arc<Reader>,
+    pub scene: Scene,
 }
 
 impl World {
     /// A ball of tissue in air, of which one octant has been rewritten.
-    fn new() -> Self {
+    pub fn new() -> Self {
         let grid = Grid::axis_aligned([64; 3], [1.0; 3]);
         let ball = |n: usize| [n % 64, n / 64 % 64, n / 4096].iter().map(|&c| (c as f64 - 31.5).powi(2)).sum::<f64>() < 28.0 * 28.0;
         let voxels = (0..grid.voxel_count()).map(|n| if ball(n) { 60 } else { -1000 }).collect();
@@ -109,7 +113,7 @@ impl World {
             brick.summarise();
         }
         t.commit();
-        let reader = Reader::open(&domain, Role::Rendering).unwrap();
+        let reader = Arc::new(Reader::open(&domain, Role::Rendering).unwrap());
         let mut scene = Scene::builtin_default();
         scene.rendering.size = [160, 120];
         scene.rendering.section_size = [64, 64];
@@ -120,7 +124,7 @@ impl World {
         View::new(&self.scene, &BoxMm::of(&self.reader.info().grid)).unwrap()
     }
 
-    fn draw(&self, composer: &mut Composer, source: &impl BrickSource) -> Vec<u8> {
+    pub fn draw(&self, composer: &mut Composer, source: &impl BrickSource) -> Vec<u8> {
         composer.draw(source, None, &self.view(), None, false, None).unwrap();
         let mut pixels = vec![0; composer.bytes()];
         composer.write(&mut pixels, maille_contract::FrameHeader::default());

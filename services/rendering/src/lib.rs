@@ -8,8 +8,11 @@
 
 #![forbid(unsafe_code)]
 
+mod backend;
 mod breath;
 mod compose;
+#[cfg(test)]
+mod gpu_tests;
 #[cfg(test)]
 mod in_place;
 mod needle;
@@ -22,7 +25,7 @@ use maille_raycast::{FrameBudget, Quality};
 use maille_scene::{BoxMm, Machine, Scene};
 use maille_store::Reader;
 use maille_transport::{Domain, FramePublisher, Life, Node, monotonic_ns};
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 use thiserror::Error;
 
 /// Why the rendering process could not start.
@@ -56,7 +59,7 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     let domain = Domain::named(domain)?;
     let mut life = Life::begin(&domain, Role::Rendering)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| RenderingError::Scene(e.to_string()))?;
-    let reader = Reader::open(&domain, Role::Rendering)?;
+    let reader = Arc::new(Reader::open(&domain, Role::Rendering)?);
     // nothing is mapped, and nothing of it runs, in a scene that does not breathe
     let mut regions = maille_breathing::Regions::open(&domain, &scene)?;
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
@@ -70,6 +73,7 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     let mut view = view::View::new(&scene, &BoxMm::of(&reader.info().grid))?;
     let tolerance_mm = scene.breathing.picture_tolerance_mm;
     let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm)));
+    composer.backend = backend::Backend::of(&scene, &reader);
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
@@ -135,6 +139,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
             life.cell().count(Counter::Refused, 1);
             continue;
         }
+        let (on_gpu, failures) = composer.backend.end();
+        life.cell().count(Counter::GpuFailures, failures);
         budget.drawn(composer.view_ns as f64 * 1e-6);
         // the 3D view has what sections, warp and the map of empty space leave of the period, a quarter of it at least
         let others_ns = render_ns.saturating_sub(composer.view_ns);
@@ -147,9 +153,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         if !life.record(now, monotonic_ns() - now, None) {
             continue;
         }
-        if quality != Quality::FULL {
-            life.cell().count(Counter::Coarse, 1);
-        }
+        life.cell().count(Counter::Coarse, u64::from(quality != Quality::FULL));
+        life.cell().count(Counter::OnGpu, u64::from(on_gpu));
         if let Some((off_mm, unsettled)) = breather.as_ref().map(breath::Breather::report) {
             life.control().warp.record((off_mm * 1e6) as u64);
             life.cell().count(Counter::Failures, unsettled);

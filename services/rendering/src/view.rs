@@ -10,6 +10,7 @@ pub(crate) struct View {
     scene_settings: Settings,
     scene_camera: Camera,
     endoscope_fov_deg: f64,
+    endoscope_barrel: f64,
     endoscope: bool,
     isosurface: bool,
     threshold_hu: f64,
@@ -29,6 +30,7 @@ impl View {
             scene_settings: Settings::volume(transfer(&r.transfer)?),
             scene_camera: Camera { eye: view.eye, target: view.target, up: view.up, fov_deg: view.fov_deg },
             endoscope_fov_deg: r.endoscope_fov_deg,
+            endoscope_barrel: r.endoscope_barrel,
             endoscope: r.camera == CameraKind::Endoscope,
             isosurface: r.mode == Mode::Isosurface,
             threshold_hu: scene.deformation.threshold_hu,
@@ -87,6 +89,11 @@ impl View {
                 None => (self.scene_camera, false),
             },
         }
+    }
+
+    /// Barrel distortion of the 3D view's lens.
+    pub fn barrel(&self, at_tip: bool) -> f64 {
+        if at_tip { self.endoscope_barrel } else { 0.0 }
     }
 
     /// The 3D view's settings.

@@ -25,6 +25,7 @@
 //! | `services.deformation.tool_moves`, `deferred`, `refused`, `inversion_failures` | moves received; commits put off for want of a slot; messages that could not be used; voxels given their nearest answer |
 //! | `services.rendering.frames`, `rate_hz`, `frame_ms` | frames after warm-up; a second; time of one |
 //! | `services.rendering.coarse_frames` | frames whose 3D view was drawn more coarsely than the scene asks for, to be in time |
+//! | `services.rendering.gpu` | in a scene with `backend = "gpu"`: `frames` all of whose pictures it drew, `failures`: pictures that the CPU drew in its place, and starts without it |
 //! | `services.rendering.warp` | in a scene that breathes: `unsettled` nodes of all frames' warps, `error_mm`, how far from its place anything in a frame may be drawn: `p50`, `p99`, `p999`, `max` |
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
@@ -93,6 +94,14 @@ pub struct WarpReport {
     pub error_mm: Durations,
 }
 
+/// What a GPU had to do with the frames of a run.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct GpuReport {
+    pub frames: u64,
+    pub failures: u64,
+}
+
 /// Of the haptic process.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -136,6 +145,8 @@ pub struct RenderingReport {
     pub rate_hz: f64,
     pub frame_ms: Durations,
     pub coarse_frames: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<GpuReport>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub warp: Option<WarpReport>,
 }
@@ -248,6 +259,7 @@ fn own(role: Role, control: &ControlBlock) -> Own {
             rate_hz,
             frame_ms: Durations::of(&cell.duration, 1e6),
             coarse_frames: n(Counter::Coarse),
+            gpu: Some(GpuReport { frames: n(Counter::OnGpu), failures: n(Counter::GpuFailures) }).filter(|g| g.frames + g.failures > 0),
             warp: breathes(&control.warp, 0)
                 .map(|_| WarpReport { unsettled: n(Counter::Failures), error_mm: Durations::of(&control.warp, 1e6) }),
         }),

@@ -115,6 +115,10 @@ pub enum Counter {
     Unmapped = 16,
     /// frames whose 3D view was drawn more coarsely than the scene asks for, to be in time (rendering)
     Coarse = 17,
+    /// frames all of whose pictures, ultrasound aside, a GPU drew (rendering)
+    OnGpu = 18,
+    /// pictures that the CPU drew in the place of the scene's GPU, and starts without one (rendering)
+    GpuFailures = 19,
 }
 
 /// Number of counters.

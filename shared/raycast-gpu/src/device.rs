@@ -53,6 +53,8 @@ pub struct Choice {
     pub software: bool,
     /// leave the import of shared memory alone, as on a device that lacks it
     pub without_import: bool,
+    /// how long a silent device is waited for [one minute]
+    pub patience: Option<Duration>,
     /// voxels in more and smaller buffers than the device asks for [bytes]: for tests
     pub buffer_bytes: Option<u64>,
 }
@@ -73,6 +75,7 @@ pub struct Gpu {
     /// most bytes of one buffer of voxels
     pub(crate) buffer_bytes: u64,
     info: wgpu::AdapterInfo,
+    patience: Duration,
     lost: Arc<Mutex<Option<String>>>,
 }
 
@@ -139,7 +142,7 @@ impl Gpu {
                 told.get_or_insert_with(|| error.to_string());
             }
         }));
-        Ok(Self { device, queue, import: host, limits, buffer_bytes, info, lost })
+        Ok(Self { device, queue, import: host, limits, buffer_bytes, info, patience: choice.patience.unwrap_or(PATIENCE), lost })
     }
 
     /// Name and driver, for logs.
@@ -182,7 +185,7 @@ impl Gpu {
 
     /// Waits until a submission is done.
     pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
-        let done = self.device.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(PATIENCE) });
+        let done = self.device.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(self.patience) });
         self.alive()?;
         done.map(|_| ()).map_err(|e| GpuError::Lost(e.to_string()))
     }

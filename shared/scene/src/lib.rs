@@ -36,6 +36,6 @@ pub use plan::{Machine, Plan, ProcessPlan, SegmentPlan, plan};
 pub use registry::{Channel, Effect, Knob, Process};
 pub use resolve::View;
 pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
-pub use sections::{CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering};
+pub use sections::{Backend, CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering};
 pub use tissue::Tissue;
 pub use tool::{Approach, Device, DeviceSection, PROFILES, PathPoint, RealDevice, Shape, Tool, ToolKind};

@@ -85,6 +85,7 @@ pub static LIMITS: &[Limit] = limits! {
     rendering.rate_hz: 1 ..= 240 ["Hz"] |s| Some(s.rendering.rate_hz);
     rendering.fov_deg: 1 ..= 170 ["°"] |s| Some(s.rendering.fov_deg);
     rendering.endoscope_fov_deg: 1 ..= 170 ["°"] |s| Some(s.rendering.endoscope_fov_deg);
+    rendering.endoscope_barrel: 0 ..= 2 [""] |s| Some(s.rendering.endoscope_barrel);
     rendering.distance: 0.05 ..= 10 [""] |s| Some(s.rendering.distance);
     rendering.step: 0.05 ..= 4 ["voxels"] |s| Some(s.rendering.step);
     rendering.opacity_end: 0.5 ..= 1 [""] |s| Some(s.rendering.opacity_end);

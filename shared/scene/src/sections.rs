@@ -177,6 +177,17 @@ pub enum CameraKind {
     Endoscope,
 }
 
+/// What draws.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Backend {
+    /// the ray caster on the CPU
+    #[default]
+    Cpu,
+    /// its twin on a GPU, by Vulkan; ultrasound, and whatever it cannot draw, falls to the CPU
+    Gpu,
+}
+
 /// `[rendering]`: the ray caster and the section views.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -205,6 +216,8 @@ pub struct Rendering {
     pub fov_deg: f64,
     /// vertical angle of view of the endoscope [degrees], 1 to 170
     pub endoscope_fov_deg: f64,
+    /// barrel distortion of the endoscope's lens, 0 (none) to 2
+    pub endoscope_barrel: f64,
     /// direction from the looked-at point to the eye (LPS, any length), where `eye` is not given
     pub from: [f64; 3],
     /// looked-at point as a fraction of the box along the LPS axes, where `target` is not given
@@ -213,6 +226,8 @@ pub struct Rendering {
     pub distance: f64,
     /// sampling step along the ray, in units of the smallest spacing, 0.05 to 4 (a knob)
     pub step: f64,
+    /// what draws: `cpu` or `gpu`
+    pub backend: Backend,
     /// while things move, draw the 3D view with fewer pixels and longer steps where that is needed to hold `rate_hz`; at rest it is whole
     pub adapt: bool,
     /// gradient shading
@@ -240,10 +255,12 @@ impl Default for Rendering {
             up: [0.0, 0.0, 1.0],
             fov_deg: 30.0,
             endoscope_fov_deg: 90.0,
+            endoscope_barrel: 0.2,
             from: [0.35, -1.0, 0.2],
             look_at: [0.5, 0.5, 0.5],
             distance: 0.75,
             step: 1.0,
+            backend: Backend::Cpu,
             adapt: true,
             shading: true,
             opacity_end: 0.99,
