@@ -21,6 +21,17 @@ pub enum Width {
     Avx512,
 }
 
+/// A part of the picture.
+#[derive(Clone, Copy, Debug)]
+pub struct Area {
+    /// its first pixel
+    pub first: [usize; 2],
+    /// pixels across and down
+    pub size: [usize; 2],
+    /// no ray sees anything nearer than this [mm]
+    pub clear: f32,
+}
+
 /// The widest that this processor runs.
 pub fn widest() -> Width {
     #[cfg(target_arch = "x86_64")]
@@ -35,17 +46,16 @@ pub fn widest() -> Width {
     Width::Portable
 }
 
-/// Casts the rays of a tile, in which nothing is to be seen nearer than `clear` [mm]; a width that this processor has not is taken for [`Width::Portable`].
+/// Casts the rays of a tile; a width that this processor has not is taken for [`Width::Portable`].
 pub fn cast_tile<S: BrickSource + ?Sized>(
     width: Width,
     stage: &Stage<'_, S>,
     ends: Option<&Ends<'_>>,
     mut warp: Option<&mut Tile<'_>>,
-    clear: f32,
-    first: [usize; 2],
-    size: [usize; 2],
+    area: Area,
     put: impl FnMut(usize, usize, Seen),
 ) {
+    let Area { first, size, clear } = area;
     #[cfg(target_arch = "x86_64")]
     {
         use crate::lanes::{avx2::Avx2, avx512::Avx512};

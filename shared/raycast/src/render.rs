@@ -6,7 +6,7 @@ use crate::{
     frame::Frame,
     geometry::Geometry,
     labels::Labels,
-    packet::{self, Width},
+    packet::{self, Area, Width},
     picture::Picture,
     raster::{Band, Solids},
     scalar::{Caster, Seen},
@@ -187,7 +187,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                 Some(lanes) => {
                     let (first, size) = ([x0, n * BAND], [columns, rows]);
                     let clear = if tile.is_none() { beam::clear(&frame, skip, first, size) } else { 0.0 };
-                    packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), clear, first, size, put);
+                    packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), Area { first, size, clear }, put);
                 }
                 None => (n * BAND..n * BAND + rows).for_each(|y| {
                     (x0..x0 + columns).for_each(|x| {
