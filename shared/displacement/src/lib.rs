@@ -6,18 +6,24 @@
 //! X, x and u count voxels along the grid's axes, so that no kernel multiplies by a direction matrix; [`along_axes`] and
 //! [`in_patient`] take vectors between patient millimetres and the grid's axes.
 //!
+//! One point at a time ([`Inverter`]), the points of a row ([`RowField`]), or four nodes of a grid in the widest registers there are ([`Nodes`]
+//! over [`quads`], the only place with unsafe code).
+//!
 //! Invariants: a solver never returns a position that it has not checked (`Inverse::converged` tells); no allocation.
 //! Not here: where the field is stored (see `maille-chainmail`), searches beside voids (see `maille-mapper`).
 
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod axes;
 mod invert;
+mod nodes;
+pub mod quads;
 mod row;
 mod trilinear;
 
 pub use axes::{along_axes, in_patient};
 pub use invert::{Inverse, Inverter, Scheme};
+pub use nodes::{Nodes, Stored};
 pub use row::{RowField, RowOutcome};
 pub use trilinear::trilinear;
 

@@ -7,10 +7,13 @@ mod at;
 mod collapse;
 mod container;
 mod fit;
+mod follow;
 mod kind;
 mod packed;
 mod remake;
 mod rotation;
+mod slab;
+mod steep;
 mod whole;
 
 pub use at::{MotionAt, PointInverse};

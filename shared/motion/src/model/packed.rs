@@ -7,6 +7,9 @@
 //! Given and taken: vectors in LPS mm. Not here: where the bytes are (owned or borrowed).
 
 use super::super::MotionError;
+use super::follow::{four, put};
+use super::kind::MAX_TERMS;
+use maille_displacement::quads::{Quads, Task};
 use maille_volume::{Grid, VectorField};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -149,17 +152,63 @@ impl PackedField<'_> {
         forward * Vector3::new(f64::from(x), f64::from(y), f64::from(z))
     }
 
-    /// out += c·B over a run of nodes, two in a register; what lies beyond the last node is 0.
-    pub(super) fn add_to(&self, first: usize, c: f32, out: &mut [f32x8]) {
+    /// A run of nodes as they lie there, and what makes index units of them.
+    pub(super) fn part(&self, first: usize, count: usize) -> (Part<'_>, f32) {
         match &self.nodes {
-            Nodes::F32(v) => add(&v[first..], out, |pair| bytemuck::cast::<[[f32; 4]; 2], f32x8>(pair) * c),
-            Nodes::F16(v) => {
-                add(&v[first..], out, |[a, b]| bytemuck::cast::<[[f32; 4]; 2], f32x8>([a.map(f32_from_half), b.map(f32_from_half)]) * c)
+            Nodes::F32(v) => (Part::F32(&v[first..first + count]), 1.0),
+            Nodes::F16(v) => (Part::F16(&v[first..first + count]), 1.0),
+            Nodes::I16(v) => (Part::I16(&v[first..first + count]), self.measures.scale),
+        }
+    }
+}
+
+/// Nodes of a run.
+#[derive(Clone, Copy)]
+pub(super) enum Part<'a> {
+    F32(&'a [[f32; 4]]),
+    F16(&'a [[u16; 4]]),
+    I16(&'a [[i16; 4]]),
+}
+
+/// Σ c_k·B_k over a run of nodes, in whole steps.
+pub(super) struct Sum<'a> {
+    terms: [Option<(Part<'a>, f32)>; MAX_TERMS],
+    count: usize,
+    out: &'a mut [[i16; 4]],
+}
+
+impl<'a> Sum<'a> {
+    pub(super) fn new(out: &'a mut [[i16; 4]]) -> Self {
+        Self { terms: [None; MAX_TERMS], count: 0, out }
+    }
+
+    /// One more term, `steps` an index unit.
+    pub(super) fn add(&mut self, (part, scale): (Part<'a>, f32), steps: f32) {
+        self.terms[self.count] = Some((part, scale * steps));
+        self.count += 1;
+    }
+}
+
+impl Task for Sum<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<Q: Quads>(self, q: Q) {
+        let mut first = 0;
+        while first < self.out.len() {
+            let mut sum = q.splat(0.0);
+            for (part, c) in self.terms[..self.count].iter().flatten() {
+                let term = match part {
+                    Part::F32(v) => q.load(&four(v, first)),
+                    Part::F16(v) => q.load_half(&four(v, first)),
+                    Part::I16(v) => q.load_narrow(&four(v, first)),
+                };
+                sum = q.fma(term, q.splat(*c), sum);
             }
-            Nodes::I16(v) => {
-                let c = c * self.measures.scale;
-                add(&v[first..], out, |pair| two_nodes(pair) * c);
-            }
+            let mut nodes = [[0; 4]; 4];
+            q.store_narrow(sum, &mut nodes);
+            put(self.out, first, &nodes);
+            first += 4;
         }
     }
 }
@@ -168,15 +217,6 @@ impl PackedField<'_> {
 #[inline(always)]
 pub(super) fn two_nodes(pair: [[i16; 4]; 2]) -> f32x8 {
     i32x8::from_i16x8(bytemuck::cast(pair)).round_float()
-}
-
-#[inline(always)]
-fn add<T: Copy + Default>(nodes: &[[T; 4]], out: &mut [f32x8], term: impl Fn([[T; 4]; 2]) -> f32x8) {
-    let (pairs, last) = nodes.as_chunks::<2>();
-    out.iter_mut().zip(pairs).for_each(|(o, &pair)| *o += term(pair));
-    if let (Some(o), Some(&node)) = (out.get_mut(pairs.len()), last.first()) {
-        *o += term([node, [T::default(); 4]]);
-    }
 }
 
 /// Largest row sum of |∂u_c/∂X_d| over forward differences: the contraction of the trilinear field in the max norm of mm.

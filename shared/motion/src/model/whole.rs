@@ -1,17 +1,22 @@
 //! The inverse of one field at all of its nodes, each answer checked against the field as it was given.
 //!
-//! Sought is v with x + v(x) = X, X + u(X) = x, at every node x, u trilinear between nodes. Rows are inverted by `maille-displacement`'s Newton in index
-//! units, a row from the answers of the row before it, slices in parallel; what a row does not settle goes on damped. An answer is claimed
-//! only if |v + u(x + v)|, taken in f64 from the vectors in mm, is at most the tolerance, X lies on the grid (to the tolerance), and det(1 + ∂u/∂X) > 0 there.
+//! Sought is v with x + v(x) = X, X + u(X) = x, at every node x, u trilinear between nodes. Slabs of slices are inverted in parallel, four nodes at a time
+//! ([`Slab`]); what they do not settle goes on by damped Newton. An answer is claimed only if |v + u(x + v)| is at most the tolerance, X lies on
+//! the grid (to the tolerance), and det(1 + ∂u/∂X) > 0 there. Where a field contracts everywhere the determinant is known, and the residual is that of
+//! f32 and a bound on its rounding; what that does not decide is taken in f64 from the vectors in mm.
 //!
 //! Search, for nodes without an answer: a cell's image lies in the box of its eight displaced corners, since trilinear interpolation is convex. So a node
 //! in no cell's box has no inverse on the grid, and that is proved; of the cells whose box holds it, the one whose affine part brings
 //! it nearest to its centre is tried. Bounded: one cell a node; boxes of more than [`WIDE`] nodes are only remembered as one box.
 //!
-//! Cost: about three evaluations a node. Memory: 16 bytes a node, and 8 more when nodes are searched. Deterministic.
+//! Cost: two to three evaluations a node. Memory: 16 bytes a node, and 8 more when nodes are searched. Deterministic.
 
 use super::super::MotionError;
 use super::at::Shape;
+use super::slab::{Common, Found, SLICES, Slab};
+use super::steep::SteepWide;
+use maille_displacement::Nodes;
+use maille_displacement::quads::{self, Width};
 use maille_displacement::{DisplacementField, FieldSample, Inverter, RowField, Scheme};
 use maille_volume::{ScalarField, VectorField};
 use nalgebra::{Matrix3, Vector3};
@@ -34,8 +39,6 @@ pub struct FieldInverse {
     pub searched: usize,
 }
 
-/// Nodes inverted at once.
-const ROW: usize = 32;
 /// Nodes in the box of a cell beyond which the cell is not searched.
 const WIDE: usize = 512;
 
@@ -52,23 +55,27 @@ enum State {
 /// # Errors
 /// When the grid has fewer than two nodes along an axis, or a vector is not finite.
 pub fn invert_field(field: &VectorField, tolerance_mm: f64) -> Result<FieldInverse, MotionError> {
+    invert_field_with(field, tolerance_mm, Width::best())
+}
+
+/// [`invert_field`] with other vectors of the processor.
+fn invert_field_with(field: &VectorField, tolerance_mm: f64, width: Width) -> Result<FieldInverse, MotionError> {
     let grid = &field.grid;
     let count = grid.voxel_count();
     if grid.size.iter().any(|&s| s < 2) || field.vectors.len() != count {
         return Err(MotionError::Fields { needed: 1, given: 0 });
     }
     let whole = Whole::new(field, tolerance_mm)?;
-    let slice = grid.size[0] * grid.size[1];
-    let mut vectors = vec![[f32::NAN; 3]; count];
-    let mut residuals = vec![-1.0f32; count];
+    let slab = SLICES * grid.size[0] * grid.size[1];
+    // every node is written, by the slab that it lies in
+    let mut vectors = vec![[0.0f32; 3]; count];
+    let mut residuals = vec![0.0f32; count];
     let mut states = vec![State::Open; count];
-    vectors
-        .par_chunks_mut(slice)
-        .zip(residuals.par_chunks_mut(slice))
-        .zip(states.par_chunks_mut(slice))
-        .enumerate()
-        .for_each(|(k, ((vectors, residuals), states))| whole.invert_slice(k, vectors, residuals, states));
-    let searched = if states.iter().all(|s| *s == State::Settled) { 0 } else { whole.search(&mut vectors, &mut residuals, &mut states) };
+    let slabs = vectors.par_chunks_mut(slab).zip(residuals.par_chunks_mut(slab)).zip(states.par_chunks_mut(slab)).enumerate();
+    slabs.for_each(|(n, ((vectors, residuals), states))| whole.invert_slab(n * SLICES, width, vectors, residuals, states));
+    // where a field contracts a rest position is the only one: what lies beyond is not found elsewhere
+    let known = |s: &State| *s == State::Settled || (whole.contracts && *s == State::Beyond);
+    let searched = if states.iter().all(known) { 0 } else { whole.search(&mut vectors, &mut residuals, &mut states) };
     let of = |state: State| states.iter().filter(|s| **s == state).count();
     let (outside, failures) = (of(State::Beyond), of(State::Open));
     Ok(FieldInverse {
@@ -91,24 +98,41 @@ struct Whole<'a> {
     tolerance_mm: f64,
     /// how far beyond the last node an answer still lies on the grid [voxels]
     slack: [f64; 3],
+    /// whether u contracts everywhere: then nothing is folded
+    contracts: bool,
+    /// what rounding in f32 may have kept from a residual [mm]
+    rounding_mm: f32,
 }
 
 impl<'a> Whole<'a> {
     fn new(given: &'a VectorField, tolerance_mm: f64) -> Result<Self, MotionError> {
         let grid = &given.grid;
         let index_from_mm = grid.index_from_world_matrix();
-        let in_index = |v: &[f32; 3]| {
-            let u = index_from_mm * Vector3::from(v.map(f64::from));
-            [u.x as f32, u.y as f32, u.z as f32, 0.0]
+        let m = index_from_mm.map(|c| c as f32);
+        let in_index = |&[x, y, z]: &[f32; 3]| {
+            let row = |r: usize| m[(r, 0)] * x + m[(r, 1)] * y + m[(r, 2)] * z;
+            [row(0), row(1), row(2), 0.0]
         };
         let nodes: Vec<[f32; 4]> = given.vectors.par_iter().map(in_index).collect();
-        if let Some(node) = nodes.par_iter().position_first(|v| !v.iter().all(|c| c.is_finite())) {
+        let size = grid.size;
+        let of = |a: f32, b: f32| if a.is_nan() || a > b { a } else { b };
+        let [longest, steep] = (0..size[2])
+            .into_par_iter()
+            .map(|slice| quads::run(SteepWide { nodes: &nodes, size, slice }))
+            .reduce(|| [0.0; 2], |a, b| [a[0].max(b[0]), of(a[1], b[1])]);
+        if steep.is_nan()
+            && let Some(node) = nodes.par_iter().position_first(|v| !v.iter().all(|c| c.is_finite()))
+        {
             return Err(MotionError::Vector { field: 0, node });
         }
         // the max norm of three components bounds the length to √3; below a few units of rounding of an index f32 cannot go,
         // the rest is done in f64
         let reach = 4.0 * f32::EPSILON * grid.size.into_iter().max().unwrap_or(1) as f32;
         let tolerance = ((0.5 * tolerance_mm / grid.min_spacing()) as f32).max(reach);
+        // a dozen roundings of numbers as long as the longest component, on the way to nodes, between them and to mm; and of a place on the grid, where a
+        // cell's border is missed by its last digit
+        let largest = size.into_iter().max().unwrap_or(1) as f32;
+        let rounding_mm = grid.spacing.iter().fold(0.0f64, |m, s| m.max(*s)) as f32 * f32::EPSILON * (12.0 * longest + largest);
         let inverter = Inverter { scheme: Scheme::Newton, tolerance, contraction: 0.0, weight: [1.0; 3], max_iterations: 60 };
         Ok(Self {
             given,
@@ -119,6 +143,8 @@ impl<'a> Whole<'a> {
             inverter: inverter.on_spacing(grid.spacing.map(|s| s as f32)),
             tolerance_mm,
             slack: grid.spacing.map(|s| tolerance_mm / s),
+            contracts: steep < 0.99,
+            rounding_mm,
         })
     }
 
@@ -127,34 +153,45 @@ impl<'a> Whole<'a> {
         [at % nx, at / nx % ny, at / (nx * ny)]
     }
 
-    fn invert_slice(&self, k: usize, vectors: &mut [[f32; 3]], residuals: &mut [f32], states: &mut [State]) {
-        let [nx, ny, _] = self.given.grid.size;
-        // v of the row before, and where it leads: by its change from the row before that
-        let (mut before, mut lead) = (vec![f32x4::ZERO; nx], vec![f32x4::ZERO; nx]);
-        for (j, block) in (0..ny).flat_map(|j| (0..nx.div_ceil(ROW)).map(move |block| (j, block))) {
-            let first = block * ROW;
-            let range = 0..ROW.min(nx - first);
-            let target: [f32x4; ROW] = std::array::from_fn(|n| f32x4::new([(first + n) as f32, j as f32, k as f32, 0.0]));
-            let (mut position, mut converged) = (target, [false; ROW]);
-            range.clone().for_each(|n| position[n] += lead[first + n]);
-            self.inverter.invert_row(self, &target, range.clone(), &mut position, &mut converged);
-            for n in range {
-                let (at, node) = (j * nx + first + n, [first + n, j, k]);
-                let starts = [target[n] + lead[first + n], target[n]];
-                let mut found = converged[n].then(|| lanes(position[n]));
-                for start in starts {
-                    found = found.or_else(|| self.damped(node, lanes(start)));
-                }
-                let Some(found) = found else { continue };
-                let v = f32x4::new([found[0], found[1], found[2], 0.0]) - target[n];
-                lead[first + n] = if j == 0 { v } else { v + v - before[first + n] };
-                before[first + n] = v;
-                match self.claim(node, found) {
-                    Some((v, r)) => (vectors[at], residuals[at], states[at]) = (v, r, State::Settled),
-                    None if !self.holds(found.map(f64::from)) => states[at] = State::Beyond,
-                    None => {}
-                }
+    fn invert_slab(&self, first: usize, width: Width, vectors: &mut [[f32; 3]], residuals: &mut [f32], states: &mut [State]) {
+        let size = self.given.grid.size;
+        let column = |c: usize| std::array::from_fn(|r| if r < 3 { self.mm_from_index[(r, c)] as f32 } else { 0.0 });
+        let common = Common {
+            nodes: Nodes::new(&self.nodes, size),
+            size,
+            tolerance: self.inverter.weight.map(|w| self.inverter.tolerance / w),
+            mm_from_index: [column(0), column(1), column(2)],
+        };
+        let (tolerance_mm, count) = (self.tolerance_mm as f32, states.len() / (size[0] * size[1]));
+        let take = |at: usize, node: [usize; 3], found: Found| -> Option<[f32; 3]> {
+            let residual = found.square.sqrt() + self.rounding_mm;
+            if found.within && found.inside && self.contracts && residual <= tolerance_mm {
+                (vectors[at], residuals[at], states[at]) = (found.mm, residual, State::Settled);
+                return None;
             }
+            let (state, v, r, better) = self.decide(node, &found);
+            (vectors[at], residuals[at], states[at]) = (v, r, state);
+            better
+        };
+        quads::run_with(width, Slab { common, first, count, take });
+    }
+
+    /// What is not plain: an answer that needs a closer look, or none yet. Gives v for others to go on from, where it differs [voxels].
+    #[cold]
+    fn decide(&self, node: [usize; 3], found: &Found) -> (State, [f32; 3], f32, Option<[f32; 3]>) {
+        let none = (State::Open, [f32::NAN; 3], -1.0);
+        let position = |v: [f32; 3]| std::array::from_fn(|c| node[c] as f32 + v[c]);
+        let finite = found.v.iter().all(|c| c.is_finite());
+        let mut at = (found.within && finite).then(|| position(found.v));
+        for start in [found.v, [0.0; 3]] {
+            at = at.or_else(|| start.iter().all(|c| c.is_finite()).then(|| self.damped(node, position(start))).flatten());
+        }
+        let Some(at) = at else { return (none.0, none.1, none.2, (!finite).then_some([0.0; 3])) };
+        let better = (!found.within).then(|| std::array::from_fn(|c| at[c] - node[c] as f32));
+        match self.claim(node, at) {
+            Some((v, r)) => (State::Settled, v, r, better),
+            None if !self.holds(at.map(f64::from)) => (State::Beyond, none.1, none.2, better),
+            None => (none.0, none.1, none.2, better),
         }
     }
 
@@ -375,6 +412,19 @@ mod tests {
             }
         }
         assert!(claimed > 20_000 && claimed + found.outside == u.vectors.len());
+    }
+
+    #[test]
+    fn every_width_claims_the_same_nodes_within_the_tolerance() {
+        let u = field(|[i, j, k]| [3.0 * (i * 0.2 + k * 0.1).sin(), 2.0 * (j * 0.15).cos(), 2.5 * (i * 0.1 - j * 0.12).sin()]);
+        let [portable, others @ ..] = Width::ALL.map(|width| invert_field_with(&u, 1e-4, width).unwrap());
+        for other in others {
+            assert_eq!((portable.outside, portable.failures), (other.outside, other.failures));
+            for (a, b) in portable.field.vectors.iter().zip(&other.field.vectors) {
+                // residuals of 1e-4 each, over 1 − q with q below one half
+                assert!(a[0].is_nan() == b[0].is_nan() && !(0..3).any(|c| (a[c] - b[c]).abs() > 4e-4), "{a:?} {b:?}");
+            }
+        }
     }
 
     #[test]
