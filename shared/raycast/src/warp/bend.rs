@@ -3,9 +3,8 @@
 //! The parabola of a lane is read when it comes into another slab between planes, for all lanes of the packet that are there.
 //! Gradients turn with the warp: ∇ₓ f(X(x)) = (1 + ∂v/∂x)ᵀ ∇f, the derivative at the packet's middle, linear in s.
 //!
-//! How far a lane may jump in rest space out of a box of empty cells: its straight continuation is off by c Δs² at most within the slab, by
-//! half the largest bending times length² beyond it. So within the slab the box is smaller by |c|; beyond, by whole cells, and the jump
-//! ends where bending could have used them up.
+//! How far a lane may jump in rest space out of a box of empty cells: nowhere does it go faster, forwards or backwards along an axis, than the
+//! straight ray and the steepest v of the picture together. So it stays in the box for as long as either wall is away at that speed.
 
 use super::{lattice::Warp, tile::Tile};
 use crate::{
@@ -34,12 +33,12 @@ struct Slab<L: Lanes> {
 pub(crate) struct Bend<'t, 'v, L: Lanes> {
     tile: &'t mut Tile<'v>,
     pixel: [usize; 2],
+    /// nodes of the tile around the packet, and what share of each its lanes have
+    cell: usize,
+    shares: [L::Float; 4],
     /// slabs a step, and slab coordinate at q = 0
     rate: L::Float,
-    /// its inverse
-    steps: L::Float,
     base: L::Float,
-    delta: [L::Float; 3],
     /// slab of each lane
     slab: L::Float,
     parabola: [[L::Float; 3]; 3],
@@ -51,10 +50,10 @@ pub(crate) struct Bend<'t, 'v, L: Lanes> {
     turned: L::Float,
     /// ∂v_c/∂x_d at row 3 d + c, and its change over the slab
     turn: [[L::Float; 9]; 2],
-    /// steps that an index takes at least, along each axis
-    slowest: [L::Float; 3],
-    /// steps after which bending may have used up a cell
-    straight: f32,
+    /// steps that an index takes at least, along each axis, forwards and backwards
+    slowest: [[L::Float; 2]; 3],
+    /// the same whichever way it goes
+    either: [L::Float; 3],
 }
 
 impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
@@ -65,20 +64,27 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
         let rate = frame.step / view.apart;
         let zero = l.set(0.0);
         let slab = |zero| Slab { number: -1, parabola: [[zero; 3]; 3], turned: -1.0, turns: [[f32x4::ZERO; 3]; 2] };
+        let (cell, place, width) = tile.cell(pixel);
+        let across = l.load(&std::array::from_fn(|n| place[0] + (n % L::ACROSS) as f32 * width));
+        let down = l.load(&std::array::from_fn(|n| place[1] + (n / L::ACROSS) as f32 * width));
+        let (left, above) = (l.set(1.0) - across, l.set(1.0) - down);
+        let fastest = axes!(d => l.set(view.steepest[d] * frame.step));
+        let least = l.set(TINY);
+        let slowest = axes!(d => [l.set(1.0) / (fastest[d] + delta[d]).max(least), l.set(1.0) / (fastest[d] - delta[d]).max(least)]);
         Self {
             pixel,
+            cell,
+            shares: [left * above, across * above, left * down, across * down],
             rate: l.set(rate),
-            steps: l.set(1.0 / rate),
             base: (start - l.set(view.first)) * l.set(1.0 / view.apart),
-            delta,
             slab: l.set(-1e9),
             parabola: [[zero; 3]; 3],
             slabs: [slab(zero), slab(zero)],
             local: zero,
             turned: l.set(-1e9),
             turn: [[zero; 9]; 2],
-            slowest: axes!(d => l.set(1.0) / (delta[d].abs() + l.set(view.steepest[d] * frame.step))),
-            straight: (2.0 * CELL as f32 / (view.bending * frame.step * frame.step)).sqrt(),
+            either: axes!(d => slowest[d][0].min(slowest[d][1])),
+            slowest,
             tile,
         }
     }
@@ -86,7 +92,7 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
     /// Steps that an index in rest space takes at least, along each axis.
     #[inline(always)]
     pub fn slowest(&self) -> &[L::Float; 3] {
-        &self.slowest
+        &self.either
     }
 
     /// Rest positions of samples at q, whose world positions are p.
@@ -130,52 +136,26 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
     #[inline(always)]
     fn read(&mut self, l: L, number: i32) {
         self.tile.fill(number as usize);
-        let (corner, place, width) = self.tile.corners(number as usize, self.pixel);
-        let across = l.load(&std::array::from_fn(|n| place[0] + (n % L::ACROSS) as f32 * width));
-        let down = l.load(&std::array::from_fn(|n| place[1] + (n / L::ACROSS) as f32 * width));
         let slab = &mut self.slabs[number as usize & 1];
         slab.number = number;
+        let corners = self.tile.corners(number as usize, self.cell);
+        let [p, q, r, t] = self.shares;
         for (m, out) in slab.parabola.iter_mut().enumerate() {
-            let [p, q, r, t] = [corner[0][m], corner[1][m], corner[2][m], corner[3][m]];
-            let (x, y, both): ([f32; 4], [f32; 4], [f32; 4]) = ((q - p).to_array(), (r - p).to_array(), (t - q - r + p).to_array());
-            let p = p.to_array();
-            for d in 0..3 {
-                let first = across.fma(l.set(x[d]), l.set(p[d]));
-                let slope = across.fma(l.set(both[d]), l.set(y[d]));
-                out[d] = down.fma(slope, first);
-            }
+            *out = axes!(d => l.set(corners[3][m][d]).fma(t, l.set(corners[2][m][d]).fma(r, l.set(corners[1][m][d]).fma(q, l.set(corners[0][m][d]) * p))));
         }
     }
 
     /// Steps that rays surely stay in the box of empty cells around rest positions p: the box reaches d − 1 cells beyond their cell.
     #[inline(always)]
     pub fn way_out(&self, l: L, d: L::Float, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
-        let zero = l.set(0.0);
-        let rest = (l.set(1.0) - self.local).max(zero);
-        // a third of the cells is left to bending
-        let spare = (d * l.set(0.34)).whole().float();
-        let (mut within, mut beyond) = (l.set(f32::INFINITY), l.set(f32::INFINITY));
-        let [_, b, c] = &self.parabola;
+        let mut least = l.set(f32::INFINITY);
+        let (cell, back) = (l.set(CELL as f32), l.set(1.0) - d);
         for n in 0..3 {
-            let slope = (self.local + self.local).fma(c[n], b[n]);
-            let speed = slope.fma(self.rate, self.delta[n]);
-            let at_end = (rest + rest).fma(c[n] * self.rate, speed);
-            let speed = speed.or(speed.abs().lt(l.set(TINY)), l.set(TINY));
-            let inverse = l.set(1.0) / speed;
-            let (low, high) = ((corner[n] + l.set(1.0) - d) * l.set(CELL as f32), (corner[n] + d) * l.set(CELL as f32));
-            let wall = low.or(zero.lt(speed), high);
-            let way = (wall - p[n]) * inverse;
-            let off = c[n].abs();
-            // a ray that turns round within the slab goes |c| at most either way
-            let turns = (speed * at_end).lt(zero);
-            let room = (p[n] - low).min(high - p[n]);
-            let turned = zero.or(off.lt(room), l.set(f32::INFINITY));
-            within = within.min((way - off * inverse.abs()).max(zero).or(turns, turned));
-            beyond = beyond.min(way - spare * l.set(CELL as f32) * inverse.abs());
+            let [forwards, backwards] = self.slowest[n];
+            let (high, low) = ((corner[n] + d) * cell, (corner[n] + back) * cell);
+            least = least.min((high - p[n]) * forwards).min((p[n] - low) * backwards);
         }
-        // ½ bending · length² is at most the spare cells: the root of 1 … 5, from below
-        let root = (spare - l.set(1.0)).fma(l.set(0.309), l.set(1.0)).only(zero.lt(spare));
-        within.min(rest * self.steps).max(beyond.min(root * l.set(self.straight)))
+        least
     }
 
     /// A gradient of rest space [per mm along the grid's axes], as world space sees it.

@@ -9,7 +9,8 @@ use wide::f32x4;
 /// Weights of four nodes in a row for a place between the second and the third (Lagrange).
 pub(super) fn cubic(t: f32) -> [f32; 4] {
     let (a, b, c) = (t + 1.0, t - 1.0, t - 2.0);
-    [-t * b * c / 6.0, a * b * c / 2.0, -a * t * c / 2.0, a * t * b / 6.0]
+    let (bc, at) = (b * c, a * t);
+    [t * bc * (-1.0 / 6.0), a * bc * 0.5, at * c * -0.5, at * b * (1.0 / 6.0)]
 }
 
 /// Memory for the warp of one tile after the other.
@@ -28,7 +29,7 @@ pub(crate) struct Tile<'a> {
     planes: Vec<f32x4>,
     /// for each slab between planes: tile that its parabolas were made for
     filled: Vec<u32>,
-    parabolas: Vec<[f32x4; 3]>,
+    parabolas: Vec<[[f32; 4]; 3]>,
     /// most nodes of a tile
     room: usize,
     /// columns' weights, and the first of the four columns, across and down
@@ -51,7 +52,7 @@ impl<'a> Tile<'a> {
             made: vec![0; planes],
             planes: vec![f32x4::ZERO; planes * room],
             filled: vec![0; planes],
-            parabolas: vec![[f32x4::ZERO; 3]; planes * room],
+            parabolas: vec![[[0.0; 4]; 3]; planes * room],
             room,
             weights: [Vec::new(), Vec::new()],
             rows: Vec::new(),
@@ -121,19 +122,25 @@ impl<'a> Tile<'a> {
             let v = |k: usize| self.planes[(slab + k) * self.room + n];
             let middle = (v(1) + v(2)) * f32x4::splat(9.0 / 16.0) - (v(0) + v(3)) * f32x4::splat(1.0 / 16.0);
             let c = (v(1) + v(2) - middle - middle) * f32x4::splat(2.0);
-            self.parabolas[slab * self.room + n] = [v(1), v(2) - v(1) - c, c];
+            self.parabolas[slab * self.room + n] = [v(1), v(2) - v(1) - c, c].map(f32x4::to_array);
         }
     }
 
-    /// The four nodes around a packet, in a slab that is there, and where the packet's first pixel is among them [nodes], and a pixel's width.
+    /// Around a packet: number of the first of its four nodes in any slab, the packet's first pixel among them [nodes], and a pixel's width.
     #[inline(always)]
-    pub fn corners(&self, slab: usize, pixel: [usize; 2]) -> ([[f32x4; 3]; 4], [f32; 2], f32) {
+    pub fn cell(&self, pixel: [usize; 2]) -> (usize, [f32; 2], f32) {
         let cell = [0, 1].map(|c| ((pixel[c] - self.first[c]) / self.fine).min(self.counts[c] - 2));
-        let at = slab * self.room + cell[1] * self.counts[0] + cell[0];
         let width = 1.0 / self.fine as f32;
         let place = [0, 1].map(|c| (pixel[c] - self.first[c] - cell[c] * self.fine) as f32 * width);
-        let p = &self.parabolas;
-        ([p[at], p[at + 1], p[at + self.counts[0]], p[at + self.counts[0] + 1]], place, width)
+        (cell[1] * self.counts[0] + cell[0], place, width)
+    }
+
+    /// The parabolas of the four nodes from a [`Tile::cell`], in a slab that is there.
+    #[inline(always)]
+    pub fn corners(&self, slab: usize, cell: usize) -> [&[[f32; 4]; 3]; 4] {
+        let p = &self.parabolas[slab * self.room + cell..];
+        let across = self.counts[0];
+        [&p[0], &p[1], &p[across], &p[across + 1]]
     }
 
     /// ∂v/∂x [mm per mm] at a pixel at the beginning of a slab, and its change to the end: for each axis d, by component.
