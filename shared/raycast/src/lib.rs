@@ -55,4 +55,4 @@ pub use settings::{Adaptive, Light, Mode, Settings, Shading, Step};
 pub use skip::{Skip, SkipUpdate};
 pub use transfer::{Preset, Transfer, TransferError};
 pub use ultrasound::{Acoustic, Echoes, Probe, Ultrasound, acoustic, echoes, ultrasound};
-pub use warp::{Moment, Motion, Warp, WarpError, WarpOptions, WarpReport};
+pub use warp::{Moment, Motion, Warp, WarpError, WarpOptions, WarpReport, resampled};

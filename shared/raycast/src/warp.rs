@@ -8,20 +8,22 @@
 //! X = x + v is put into u, and |x − X − u(X)| / (1 − q) bounds its distance from the true X if u contracts by q. What the picture's
 //! lattice adds is told by [`Warp::view_error_mm`].
 //!
-//! Empty space stays in rest space: a ray there is a parabola, known from plane to plane, and its bending is bounded beyond. So the map of
+//! Empty space stays in rest space: how fast a ray goes there, forwards and backwards along each axis, is bounded for the picture. So the map of
 //! the unwarped volume holds, nothing of it is made anew, and rays jump nearly as far as straight ones (`Bend::way_out`).
 //!
 //! Frames: positions and displacements inside are continuous indices of the volume; millimetres at the border.
-//! References: [`Reference`]. Not here: where fields come from.
+//! References, to be compared with: the paper's own scheme ([`Moment::along`]), and the volume [`resampled`]. Not here: where fields come from.
 
 mod bend;
 mod field;
 mod lattice;
+mod reference;
 mod tile;
 mod view;
 
 pub(crate) use bend::Bend;
 pub use field::{Moment, Motion, WarpError};
 pub use lattice::{Warp, WarpOptions, WarpReport};
+pub use reference::resampled;
 pub(crate) use tile::Tile;
 pub(crate) use view::View;
