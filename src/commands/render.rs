@@ -84,6 +84,9 @@ struct More {
     /// with the transfer function, show the opaque surface at this value
     #[arg(long, value_name = "HU", value_parser = finite, allow_hyphen_values = true, conflicts_with = "iso")]
     with_surface: Option<f64>,
+    /// a surface seen from nearer than a pixel a voxel is that of the smooth function, as in scenes with `smooth-surface` (not on a GPU)
+    #[arg(long)]
+    smooth: bool,
     /// samples one step apart, instead of by their weight in the picture
     #[arg(long)]
     even: bool,
@@ -191,7 +194,11 @@ pub fn run(args: &Args) -> Outcome {
             let camera = camera(args, scene.as_ref(), &bricks)?;
             let skip = pool.install(|| Skip::new(&bricks, &settings));
             let barrel = args.more.barrel.unwrap_or(0.0);
-            let extras = Extras { labels: labels.as_ref(), barrel, geometry: Some(&geometry), ..Extras::default() };
+            let zoom = args.more.smooth || scene.as_ref().is_some_and(|scene| scene.has_effect("smooth-surface"));
+            if args.more.smooth && gpu.is_some() {
+                return Err(Failure::Refused("--smooth is drawn by the processor: leave `--backend gpu` out".into()));
+            }
+            let extras = Extras { labels: labels.as_ref(), barrel, geometry: Some(&geometry), zoom, ..Extras::default() };
             let mut outcome = Ok(());
             let times = timed(frames, || {
                 let drawn = match &mut gpu {

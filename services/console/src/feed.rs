@@ -33,6 +33,8 @@ pub struct Facts {
     pub transfer_points: Vec<[f64; 5]>,
     /// whether the scene has a tool
     pub has_tool: bool,
+    /// whether the scene's tool takes tissue away, so that there is something to take back
+    pub incises: bool,
     /// name of the breathing's signal, where the patient breathes
     pub breathing: Option<String>,
 }
@@ -92,6 +94,8 @@ pub trait Feed {
     fn breath(&mut self) -> Option<&mut Signal>;
     /// Tells all how breathing is led.
     fn send_breath(&mut self, state: &BreathState);
+    /// Asks for one more stroke of incision to be taken back.
+    fn send_undo(&mut self) {}
     /// Says that the console is alive, how many frames it sent and how many requests it has refused.
     fn beat(&mut self, frames: u64, refused: u64);
     /// Whether the console should end.

@@ -9,7 +9,7 @@ use crate::{
 };
 use maille_breathing::Signal;
 use maille_contract::{
-    BreathState, Commit, FrameHeader, Role, ServiceCell, ServiceState, ToolCommand, ToolState, ViewState,
+    BreathState, Commit, FrameHeader, Role, ServiceCell, ServiceState, Stamp, ToolCommand, ToolState, UndoCommand, ViewState,
     control::{Counter, HEARTBEAT_LATE_NS},
 };
 use maille_raycast::{Preset, Transfer};
@@ -80,6 +80,7 @@ impl Live {
             transfer: scene.rendering.transfer.clone(),
             transfer_points: transfer(&scene.rendering.transfer).map(|t| presets::points(&t)).unwrap_or_default(),
             has_tool: scene.tool.is_some(),
+            incises: scene.has_effect("incision"),
             breathing: signal.is_some().then(|| scene.breathing.signal.clone().into()),
         };
         // what the last console said, or the supervisor before the first
@@ -194,6 +195,13 @@ impl Feed for Live {
 
     fn send_breath(&mut self, state: &BreathState) {
         self.life.control().breath.store(state);
+    }
+
+    fn send_undo(&mut self) {
+        // counted on from what a console before this one asked for
+        let last = self.life.control().undo.load::<UndoCommand>().map_or(0, |(command, _)| command.undos);
+        let stamp = Stamp { time_ns: self.time_ns(), sequence: last + 1, incarnation: self.incarnation() };
+        self.life.control().undo.store(&UndoCommand { stamp, undos: last + 1 });
     }
 
     fn beat(&mut self, frames: u64, refused: u64) {

@@ -6,6 +6,7 @@
 //! - `{"type":"tool","taken":true,"target_mm":[x,y,z]}` while the hand holds the tool, at least every 250 ms;
 //!   `{"type":"tool","taken":false}` lets it go;
 //! - `{"type":"breath","held":true,"level":0.4}`: the breath is held or goes on, and the slider leads it or (`null`) nobody does;
+//! - `{"type":"undo"}`: the last stroke of incision is taken back;
 //! - `{"type":"ack","frame":n}` after frame n has been drawn: the next one is sent only then.
 //!
 //! **Server → page**, JSON text: one [`Hello`] first (and again when the patient or the scene changes), then a [`State`] twenty
@@ -50,6 +51,8 @@ pub enum Request {
     Tool(ToolRequest),
     /// hold, lead or let go the breath
     Breath(BreathRequest),
+    /// take the last stroke of incision back
+    Undo(UndoRequest),
     /// a frame was drawn
     Ack {
         /// its number
@@ -115,6 +118,11 @@ pub struct ToolRequest {
     #[serde(default)]
     pub target_mm: Option<[f64; 3]>,
 }
+
+/// One stroke is taken back at a time: there is nothing to say about it.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UndoRequest {}
 
 /// The hand on the breath.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
@@ -284,6 +292,7 @@ mod tests {
             r#"{"type":"view","treshold_hu":1}"#,
             r#"{"type":"view","threshold_hu":1e999}"#,
             r#"{"type":"tool"}"#,
+            r#"{"type":"undo","strokes":2}"#,
             r#"{"type":"tool","taken":true,"target_mm":[1,2]}"#,
             r#"{"type":"ack","frame":-1}"#,
         ] {

@@ -137,6 +137,8 @@ impl<F: Feed> Pump<F> {
                         self.hub.refuse();
                     }
                 }
+                Event::Request(_, Request::Undo(_)) if self.feed.facts().incises => self.feed.send_undo(),
+                Event::Request(_, Request::Undo(_)) => self.hub.refuse(),
                 Event::Request(_, Request::Ack { .. }) => {}
                 Event::Left(page) if self.holder.as_ref().is_some_and(|h| h.page == page) => self.release(),
                 Event::Left(_) => {}

@@ -2,7 +2,7 @@
 //!
 //! For each tool move: find where the tool met the surface, pin the elements there, let ChainMail give way, let the mapper
 //! rewrite voxels, and commit voxels, displacements and state in one transaction. Moves that arrive while it works are
-//! superseded by the newest. Everything the next step depends on is in the store, so a restarted process goes on as if
+//! superseded by the newest. In a scene with incisions a move takes tissue away instead ([`incise`]), and the page takes it back. Everything the next step depends on is in the store, so a restarted process goes on as if
 //! nothing had happened (DESIGN D3).
 //!
 //! It sleeps between polls ([`POLL`]); a push is answered within that and its own work.
@@ -10,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 mod announce;
+mod incise;
 #[cfg(test)]
 mod recovery;
 mod restore;
@@ -19,7 +20,7 @@ mod step;
 use maille_chainmail::Capsule;
 use maille_contract::control::Counter;
 use maille_contract::messages::TOOL_IN_CONTACT;
-use maille_contract::{Commit, Role, ToolMove, ViewState};
+use maille_contract::{Commit, Role, ToolMove, UndoCommand, ViewState};
 use maille_scene::Scene;
 use maille_store::{Reader, Writer};
 use maille_transport::{Domain, Life, Node, monotonic_ns};
@@ -103,6 +104,14 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             }
             // a blade pushes nothing
             let _ = moves.latest();
+        }
+        if due
+            && let Some((command, _)) = life.control().undo.load::<UndoCommand>()
+            && let Some(done) = engine.undo(command.undos, &reader, &mut writer)
+        {
+            last_step = now;
+            announcer.step(&mut life, &done, now, None);
+            continue;
         }
         let Some(message) = due.then(|| moves.latest()).flatten() else {
             let tool = life.control().held_tool(now).filter(|tool| tool.flags & TOOL_IN_CONTACT != 0);

@@ -8,6 +8,7 @@ use maille_store::{Cuts, Plastic, Writer};
 pub(crate) fn restore(engine: &mut Engine, writer: &Writer) {
     for id in 0..writer.layout().count() as u32 {
         if let Some(numbers) = writer.displacement(id) {
+            engine.moved.insert(id);
             engine.mail.restore_brick(id, bytemuck::cast_ref::<_, DisplacementBrick>(numbers));
         }
         if let Some(numbers) = writer.channel::<Plastic>(id) {
@@ -15,6 +16,9 @@ pub(crate) fn restore(engine: &mut Engine, writer: &Writer) {
         }
         if let Some(cuts) = writer.channel::<Cuts>(id) {
             engine.mail.restore_cut_brick(id, cuts);
+            if let Some(incisions) = &mut engine.incisions {
+                incisions.restore(id, cuts);
+            }
         }
     }
     engine.resume();

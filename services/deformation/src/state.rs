@@ -1,5 +1,6 @@
 //! The small state that belongs to every transaction beside voxels and displacements.
 
+use crate::incise::Strokes;
 use bytemuck::{Pod, Zeroable};
 use maille_contract::Stamp;
 use maille_store::STATE_BYTES;
@@ -18,10 +19,12 @@ pub(crate) struct State {
     pub last_move: Stamp,
     /// CLOCK_MONOTONIC [ns] of the last step: from here relaxation goes on
     pub last_step_ns: u64,
+    /// of incision
+    pub strokes: Strokes,
 }
 
 /// Version of [`State`].
-pub(crate) const VERSION: u64 = 2;
+pub(crate) const VERSION: u64 = 3;
 
 const _: () = assert!(size_of::<State>() <= STATE_BYTES);
 

@@ -9,7 +9,10 @@
 //! What a scene does not call for is not there: no threshold in the links without `object-shape`, no cuts without `cutting`, no plastic
 //! part without `plasticity`.
 
-use crate::state::{State, VERSION};
+use crate::{
+    incise::{Changed, Incisions, Strokes},
+    state::{State, VERSION},
+};
 use maille_chainmail::{
     Admission, Capsule, ChainMail, ChangedRegion, LinkModel, Metric, Motion, Pin, PlasticBand, RelaxOptions, Slender, Tissue,
     elements_in_sphere, enclosing_elements, intersection_search, swept_blade,
@@ -20,6 +23,7 @@ use maille_mapper::{BrickSink, MapOptions, Mapper, Sampling, rest_position, tiss
 use maille_scene::{Pins, Push, Relaxation, Scene, ToolKind};
 use maille_store::{CommitOutcome, Cuts, Plastic, Reader, Transaction, Writer};
 use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
+use std::collections::BTreeSet;
 
 /// Pushes shorter than this are not worth a transaction [mm].
 const SHORTEST_PUSH_MM: f64 = 0.01;
@@ -45,6 +49,10 @@ pub(crate) struct Engine {
     /// where the edge was last: tip and tail [mm]; a process that starts anew begins where it first sees it, and so never cuts what it has not
     /// seen the blade go through
     edge: Option<[[f64; 3]; 2]>,
+    /// bricks whose displacement was ever stored
+    pub moved: BTreeSet<BrickId>,
+    /// where the scene's tool takes tissue away
+    pub incisions: Option<Incisions>,
 }
 
 /// How tissue goes back.
@@ -103,7 +111,14 @@ impl Engine {
         let tolerance = (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32;
         let sampling = if d.sampling_order >= 3 { Sampling::Cubic } else { Sampling::Linear };
         let map = MapOptions { tolerance, void_hu: VOID_HU, sampling, ..MapOptions::default() };
-        let state = State { version: VERSION, threshold_hu: d.threshold_hu, pushes: 0, last_move: Stamp::default(), last_step_ns: 0 };
+        let state = State {
+            version: VERSION,
+            threshold_hu: d.threshold_hu,
+            pushes: 0,
+            last_move: Stamp::default(),
+            last_step_ns: 0,
+            strokes: Strokes::default(),
+        };
         let relax = scene.has_effect("relaxation").then(|| match d.relaxation {
             Relaxation::Decay => Relax::Decay(d.relaxation_s),
             Relaxation::Elastic => Relax::Elastic(RelaxOptions { tools_hold_hu: Some(d.threshold_hu), ..RelaxOptions::default() }),
@@ -132,6 +147,8 @@ impl Engine {
             object_shape,
             blade_mm: blade.map(|tool| tool.blade_mm),
             edge: None,
+            moved: BTreeSet::new(),
+            incisions: Incisions::new(scene),
         }
     }
 
@@ -207,8 +224,36 @@ impl Engine {
         self.state.pushes > 0 && self.state.last_move == message.stamp
     }
 
-    /// Answers a tool move at `now_ns`; `None` when there is nothing to push.
+    /// Answers a tool move at `now_ns` by taking away what lies below the tip; `None` when nothing does.
+    pub fn incise(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let State { strokes, threshold_hu, .. } = &mut self.state;
+        let changed = self.incisions.as_mut()?.cut(&reader.rest(), &mut self.mail, strokes, message, *threshold_hu, now_ns)?;
+        self.state.last_move = message.stamp;
+        self.state.last_step_ns = now_ns;
+        self.state.pushes += 1;
+        Some(self.commit_incision(&changed, reader, writer))
+    }
+
+    /// Takes back a stroke of incision of those that were asked for, `undos` since the run began; `None` when all have been. That there was none to take
+    /// back is committed too, so that nobody takes a later one back for it.
+    pub fn undo(&mut self, undos: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        let incisions = self.incisions.as_mut().filter(|_| self.state.strokes.undone < undos)?;
+        self.state.strokes.undone += 1;
+        let changed = incisions.undo(&reader.rest(), &mut self.mail, &mut self.state.strokes).unwrap_or_default();
+        Some(self.commit_incision(&changed, reader, writer))
+    }
+
+    fn commit_incision(&mut self, changed: &Changed, reader: &Reader, writer: &mut Writer) -> Done {
+        Done { moved_elements: changed.elements, ..self.commit_with(&changed.region, &changed.numbered, reader, writer) }
+    }
+
+    /// Answers a tool move at `now_ns`, as the scene has it; `None` when there is nothing to do.
     pub fn step(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        if self.incisions.is_some() { self.incise(message, now_ns, reader, writer) } else { self.press(message, now_ns, reader, writer) }
+    }
+
+    /// Answers a tool move by pushing; `None` when there is nothing to push.
+    pub fn press(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         let (from, push) = self.surface_push(message, reader)?;
         let grid = &reader.info().grid;
         let beside_gaps = self.object_shape || self.blade_mm.is_some();
@@ -274,9 +319,15 @@ impl Engine {
 
     /// Maps what changed and commits voxels, displacements with their plastic part, cut links and state together.
     pub fn commit(&mut self, region: &ChangedRegion, reader: &Reader, writer: &mut Writer) -> Done {
+        self.commit_with(region, &BTreeSet::new(), reader, writer)
+    }
+
+    /// The same with bricks of which the numbers of strokes alone changed.
+    fn commit_with(&mut self, region: &ChangedRegion, numbered: &BTreeSet<BrickId>, reader: &Reader, writer: &mut Writer) -> Done {
         let mut transaction = writer.begin();
         let mapped = self.mapper.remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
-        self.commit_elements(region, &mut transaction);
+        let bricks: BTreeSet<BrickId> = region.ids().chain(numbered.iter().copied()).collect();
+        self.commit_elements(&bricks, &mut transaction);
         self.state.write(transaction.state_mut());
         let bricks = mapped.bricks.len() as u64;
         Done { outcome: transaction.commit(), moved_elements: 0, bricks, failures: mapped.failures, refused_mm: [0.0; 3] }
@@ -299,18 +350,22 @@ impl Engine {
         (length >= SHORTEST_PUSH_MM).then_some((from, push))
     }
 
-    /// All that ChainMail holds of the elements that changed. Plastic parts and cuts exist only where an effect makes them, and then the
-    /// plan has their channels.
-    fn commit_elements(&self, region: &ChangedRegion, transaction: &mut Transaction<'_>) {
-        for id in region.ids() {
-            if let Some(brick) = self.mail.displacement_brick(id) {
+    /// All that ChainMail holds of the elements of bricks. Plastic parts and cuts exist only where an effect makes them, and then the plan has
+    /// their channels; what never moved has nothing to store.
+    fn commit_elements(&mut self, bricks: &BTreeSet<BrickId>, transaction: &mut Transaction<'_>) {
+        for &id in bricks {
+            let moved = self.moved.contains(&id) || self.mail.displacement_range(id) != [[0.0; 2]; 3];
+            if let Some(brick) = self.mail.displacement_brick(id).filter(|_| moved) {
+                self.moved.insert(id);
                 transaction.displacement_mut(id).copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(brick)));
             }
             if let Some(brick) = self.mail.plastic_brick(id) {
                 transaction.channel_mut::<Plastic>(id).copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(brick)));
             }
-            if let Some(cuts) = self.mail.cut_brick(id) {
-                transaction.channel_mut::<Cuts>(id).copy_from_slice(cuts);
+            match (&self.incisions, self.mail.cut_brick(id)) {
+                (Some(incisions), _) => incisions.write(&self.mail, id, transaction.channel_mut::<Cuts>(id)),
+                (None, Some(cuts)) => transaction.channel_mut::<Cuts>(id).copy_from_slice(cuts),
+                (None, None) => {}
             }
         }
     }

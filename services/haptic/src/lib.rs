@@ -16,6 +16,7 @@ mod operator;
 mod outbox;
 mod publisher;
 mod setup;
+mod smooth;
 mod tick;
 
 use maille_contract::{Role, control::Counter};

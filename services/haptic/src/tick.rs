@@ -2,7 +2,7 @@
 
 use crate::needle::{self, NeedleStage};
 use crate::operator::{Operator, simulated_profile};
-use crate::{HapticError, breath::Breather, device, outbox::Outbox, setup};
+use crate::{HapticError, breath::Breather, device, outbox::Outbox, setup, smooth::SmoothStage};
 use maille_breathing::Patient;
 use maille_contact::{DevicePose, HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
@@ -21,6 +21,8 @@ pub(crate) struct Loop<'a> {
     operator: Operator,
     /// in a scene with a needle: it takes the place of contact
     needle: Option<NeedleStage>,
+    /// in a scene whose smooth surface is felt
+    smooth: Option<SmoothStage>,
     /// in a scene that breathes
     breather: Option<Breather<'a>>,
     threshold_hu: f64,
@@ -81,6 +83,7 @@ impl<'a> Loop<'a> {
         )?;
         Ok(Self {
             reader,
+            smooth: SmoothStage::new(scene, &rest, config.radius_mm)?,
             needle,
             core: HapticCore::new(config),
             operator: Operator::new(tool, scene.haptic.rate_hz, way, real),
@@ -129,14 +132,27 @@ impl<'a> Loop<'a> {
             self.core.set_orientation(orientation);
         }
         let snapshot = self.reader.snapshot();
-        let surface = Isosurface::new(&snapshot, self.threshold_hu);
         let epoch = snapshot.epoch();
         // tissue stands as it was committed while its owner is silent: it is felt, and said
         let owner = control.service(Role::Deformation);
         self.tissue_stands = owner.incarnation.load(Relaxed) > 0
             && (owner.state() != ServiceState::Ready || monotonic_ns.saturating_sub(owner.heartbeat_ns.load(Relaxed)) > HEARTBEAT_LATE_NS);
-        let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s: 0.0, release };
-        let mut out = self.core.tick_in(&inputs, moment.as_mut().map(|moment| moment as &mut dyn MovingTissue));
+        let (tissue_age_s, threshold_hu) = (0.0, self.threshold_hu);
+        let moving = moment.as_mut().map(|moment| moment as &mut dyn MovingTissue);
+        let mut out = match &mut self.smooth {
+            Some(smooth) => {
+                smooth.prepare(&snapshot, epoch, pose.position_mm, threshold_hu);
+                let surface = smooth.surface(&snapshot, threshold_hu);
+                let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s, release };
+                let out = self.core.tick_in(&inputs, moving);
+                smooth.felt(&out);
+                out
+            }
+            None => {
+                let surface = Isosurface::new(&snapshot, threshold_hu);
+                self.core.tick_in(&TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s, release }, moving)
+            }
+        };
         let tip_reference_mm = out.tip_mm;
         if let Some(moment) = &moment {
             moment.leave(&mut out);
@@ -269,6 +285,11 @@ impl<'a> Loop<'a> {
             if let Some(residual_mm) = self.residual_mm {
                 control.inversion.record((residual_mm * 1e6) as u64);
             }
+        }
+        if let Some(smooth) = &mut self.smooth {
+            let (loads, missing) = smooth.tally();
+            cell.count(Counter::SmoothLoads, loads);
+            cell.count(Counter::NoPatch, missing);
         }
         if let Some(out) = &self.last {
             cell.count(Counter::InContact, u64::from(out.in_contact));

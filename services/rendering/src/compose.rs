@@ -33,6 +33,8 @@ pub(crate) struct Composer {
     coarse: Picture,
     /// time that the last 3D view took [ns]
     pub view_ns: u64,
+    /// surfaces seen from near are those of the smooth function
+    zoom: bool,
 }
 
 impl Composer {
@@ -42,7 +44,8 @@ impl Composer {
         let section = || Picture::new(sw, sh);
         let [fw, fh] = if scene.has_effect("ultrasound") { scene.rendering.section_size } else { [0, 0] };
         let pictures = [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)];
-        Self { skip: None, pictures, quality: Quality::FULL, backend: Backend::default(), coarse: Picture::new(0, 0), view_ns: 0 }
+        let zoom = scene.has_effect("smooth-surface");
+        Self { skip: None, pictures, quality: Quality::FULL, backend: Backend::default(), coarse: Picture::new(0, 0), view_ns: 0, zoom }
     }
 
     /// Bytes of a frame.
@@ -85,7 +88,8 @@ impl Composer {
         let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
         let in_3d = Geometry { capsules: &thick, meshes: &[] };
         // an endoscope does not see itself
-        let extras = Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), barrel: view.barrel(at_tip), ..Extras::default() };
+        let extras =
+            Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), barrel: view.barrel(at_tip), zoom: self.zoom, ..Extras::default() };
         let start = monotonic_ns();
         if [w, h] == [whole.width, whole.height] {
             self.backend.render(&extras, source, skip, &camera, &settings, whole)?;

@@ -86,7 +86,16 @@ pub struct InversionReport {
     pub residual_mm: Durations,
 }
 
-/// The same for frames.
+/// How the smooth surface was felt.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct SmoothReport {
+    /// times that the function was loaded anew around the tip
+    pub loads: u64,
+    /// ticks in contact for which no local patch was found
+    pub without_patch: u64,
+}
+
+/// How well frames were brought together with rest.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
 pub struct WarpReport {
@@ -122,6 +131,9 @@ pub struct HapticReport {
     pub realtime: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub inversion: Option<InversionReport>,
+    /// where a smooth surface is felt
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub smooth: Option<SmoothReport>,
 }
 
 /// Of the deformation process.
@@ -244,6 +256,7 @@ fn own(role: Role, control: &ControlBlock) -> Own {
                 failures: n(Counter::Unmapped),
                 residual_mm: Durations::of(&control.inversion, 1e6),
             }),
+            smooth: Some(SmoothReport { loads: n(Counter::SmoothLoads), without_patch: n(Counter::NoPatch) }).filter(|s| s.loads > 0),
         }),
         Role::Deformation => Own::Deformation(DeformationReport {
             commits: n(Counter::Commits),

@@ -193,6 +193,11 @@ fn prepare(scene: &mut Scene, name: &str) {
                 tool.kind = ToolKind::Blade;
             }
         }
+        "incision" => {
+            if let Some(tool) = &mut scene.tool {
+                tool.kind = ToolKind::Incision;
+            }
+        }
         "needle" => {
             if let Some(tool) = &mut scene.tool {
                 tool.kind = ToolKind::Needle;

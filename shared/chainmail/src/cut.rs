@@ -104,6 +104,21 @@ impl ChainMail {
         self.remove_elements(&inside)
     }
 
+    /// The elements that lie now in the cells of voxels that `inside` takes, out of the box of voxels `low..=high`.
+    pub fn elements_now_in(&self, low: [usize; 3], high: [usize; 3], inside: impl Fn([usize; 3]) -> bool) -> Vec<[usize; 3]> {
+        let (s, size) = (self.spacing(), self.layout().size);
+        let mm = |v: [usize; 3], side: f64| std::array::from_fn(|c| (v[c] as f64 + side) * f64::from(s[c]));
+        let mut found = Vec::new();
+        self.each_element_in(mm(low, -0.5), mm(high, 0.5), |mail, voxel| {
+            let p = mail.place(voxel);
+            let cell: [f64; 3] = std::array::from_fn(|c| (p[c] / f64::from(s[c])).round());
+            if (0..3).all(|c| cell[c] >= 0.0 && cell[c] < size[c] as f64) && inside(cell.map(|v| v as usize)) {
+                found.push(voxel);
+            }
+        });
+        found
+    }
+
     /// Removes the elements of a box of voxels, `low..=high`, cut to the grid.
     pub fn remove_box(&mut self, low: [usize; 3], high: [usize; 3]) -> ChangedRegion {
         let size = self.layout().size;

@@ -8,7 +8,7 @@ use crate::{
     cell::LatestCell,
     clock::SimulationClock,
     histogram::SharedHistogram,
-    messages::{DeviceForce, DeviceState, ToolCommand, ToolState, ViewState},
+    messages::{DeviceForce, DeviceState, ToolCommand, ToolState, UndoCommand, ViewState},
     names::PINS_PER_ROLE,
     needle::{NeedleLog, NeedleState},
 };
@@ -19,7 +19,7 @@ use core::sync::atomic::{
 };
 
 /// "maille" and the version of this layout.
-pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille04");
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille05");
 /// Pins in the block.
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
@@ -119,6 +119,10 @@ pub enum Counter {
     OnGpu = 18,
     /// pictures that the CPU drew in the place of the scene's GPU, and starts without one (rendering)
     GpuFailures = 19,
+    /// ticks in contact whose local patch was not found: the smooth function's own normal is felt (haptic)
+    NoPatch = 20,
+    /// loads of the smooth function's neighbourhood: the tip moved on, or tissue under it was rewritten (haptic)
+    SmoothLoads = 21,
 }
 
 /// Number of counters.
@@ -222,6 +226,8 @@ pub struct ControlBlock {
     pub needle: LatestCell<{ words::<NeedleState>() }>,
     /// what the needle did in this run. Writer: haptic
     pub needle_log: LatestCell<{ words::<NeedleLog>() }>,
+    /// what the page wants taken back. Writer: console
+    pub undo: LatestCell<{ words::<UndoCommand>() }>,
     /// one for each [`Role`](crate::Role)
     pub services: [ServiceCell; 4],
     /// pins of the store's readers; see [`Role::pins`](crate::Role::pins)

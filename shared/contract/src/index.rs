@@ -9,7 +9,7 @@ use bytemuck::Zeroable;
 use core::sync::atomic::{AtomicU32, AtomicU64};
 
 /// "mailidx" and the version of this layout.
-pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx2");
+pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx3");
 /// Entries of a leaf page.
 pub const LEAF_LEN: usize = 64;
 /// Entry of something that does not exist.
@@ -31,7 +31,8 @@ pub enum Channel {
     State = 2,
     /// the part of the displacement that does not go back when tissue relaxes [mm, along the grid's axes], three planes of f32
     Plastic = 3,
-    /// links cut, a byte an element: bits 0, 1, 2 are the links to the next element along i, j, k
+    /// links cut, a byte an element: bits 0, 1, 2 are the links to the next element along i, j, k; bits 3 to 7 number the stroke of incision that took
+    /// the element away, 0 where none did
     Cuts = 4,
     /// labels, a byte a voxel
     Labels = 5,

@@ -24,5 +24,5 @@ pub mod segment_header;
 
 pub use breath::{BreathLead, BreathState, MotionHeader};
 pub use control::{ControlBlock, RunState, ServiceCell, ServiceState};
-pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
+pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, UndoCommand, ViewState};
 pub use names::Role;

@@ -155,6 +155,16 @@ pub struct ToolCommand {
     pub sent_ns: u64,
 }
 
+/// What the page wants taken back, in a cell of the control block. Writer: console. Reader: deformation.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct UndoCommand {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// strokes of incision that were asked to be taken back since the run began
+    pub undos: u64,
+}
+
 /// What a device outside the haptic process says of itself, in a cell of the control block. Writer: whoever drives the device. Reader:
 /// haptic.
 #[repr(C)]

@@ -42,6 +42,7 @@ pub mod twin;
 pub mod ultrasound;
 mod walk;
 pub mod warp;
+pub mod zoom;
 
 pub use budget::{FrameBudget, Quality};
 pub use camera::Camera;

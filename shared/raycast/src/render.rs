@@ -13,6 +13,7 @@ use crate::{
     settings::{Light, Mode, Settings},
     skip::Skip,
     warp::{Tile, View, Warp},
+    zoom::{Again, Lens},
 };
 use maille_volume::BrickSource;
 use rayon::prelude::*;
@@ -79,6 +80,8 @@ pub struct Extras<'a> {
     pub labels: Option<&'a Labels>,
     /// solid bodies among the voxels
     pub geometry: Option<&'a Geometry<'a>>,
+    /// surfaces seen from nearer than a pixel a voxel are sampled on the smooth function ([`crate::zoom`]); without effect through a warp
+    pub zoom: bool,
     /// barrel distortion k of the lens, at least 0: the ray of a point at radius r (1 at the upper edge) looks along r·(1 + k r²)/(1 + k),
     /// so that the field of view holds at the upper edge and what is further out shrinks
     pub barrel: f64,
@@ -162,6 +165,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
         let rows = rgb.len() / (3 * width);
         let solid = solids.as_ref().and_then(|s| s.band(n));
         let ends = solid.as_ref().map(|band| Ends { band, row: n * BAND });
+        let mut lens = (extras.zoom && view.is_none()).then(|| Lens::new(&frame, source.info().grid.min_spacing())).flatten();
         let mut tile = view.as_ref().map(|view| Tile::new(view, [TILE, BAND]));
         for x0 in (0..width).step_by(TILE) {
             let columns = TILE.min(width - x0);
@@ -177,6 +181,9 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                     behind = band.color[at];
                     // as for the volume: where half of the light is gone
                     seen.depth = if seen.transmittance > 0.5 { band.depth[at] } else { seen.depth };
+                }
+                if let Some(lens) = lens.as_mut().filter(|_| seen.transmittance == 0.0) {
+                    lens.add(x, y, seen.depth, seen.color);
                 }
                 write_pixel(seen, behind, &mut rgb[3 * at..3 * at + 3]);
                 if let Some(depth) = &mut depth {
@@ -195,6 +202,15 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                         put(x, y, caster.cast(x, y, end));
                     });
                 }),
+            }
+            if let Some(lens) = &mut lens {
+                lens.look(source, |Again { x, y, color, depth: away }| {
+                    let at = (y - n * BAND) * width + x;
+                    write_pixel(Seen { color, transmittance: 0.0, depth: away }, frame.background, &mut rgb[3 * at..3 * at + 3]);
+                    if let Some(depth) = &mut depth {
+                        depth[at] = away;
+                    }
+                });
             }
         }
     };

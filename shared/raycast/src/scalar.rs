@@ -179,17 +179,10 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
 
     /// Factors of colour and highlight at a sample.
     fn shade(&self, ray: &Ray, p: [f32; 3], q: f32) -> (f32, f32) {
-        let f = self.frame;
-        let Some(shading) = f.shading else { return (1.0, 0.0) };
-        let g = self.gradient(p);
-        let square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
-        let light = if f.at_eye { ray.direction } else { f.light };
-        let dot = (g[0] * light[0] + g[1] * light[1] + g[2] * light[2]).abs();
-        let cosine = if square > ZERO_GRADIENT { (dot / square.sqrt()).min(1.0) } else { 0.0 };
-        let distance = ray.start + q * f.step;
-        let strength = 1.0 / (1.0 + distance * distance * f.falloff);
-        let highlight = if square > ZERO_GRADIENT { shading.specular * cosine.powi(shading.power as i32) } else { 0.0 };
-        ((shading.ambient * shading.ambient_light + shading.diffuse * cosine) * strength, highlight * strength)
+        if self.frame.shading.is_none() {
+            return (1.0, 0.0);
+        }
+        shade_by(self.frame, ray, self.gradient(p), q)
     }
 
     /// Shading of matter cut open where the ray enters the volume or leaves the eye: as if facing the light.
@@ -216,6 +209,19 @@ impl<S: BrickSource + ?Sized> Caster<'_, S> {
         }
         b
     }
+}
+
+/// Factors of colour and highlight at a place q steps along a ray whose gradient is g [stored units/mm, or any, the grid's axes].
+pub fn shade_by(f: &Frame, ray: &Ray, g: [f32; 3], q: f32) -> (f32, f32) {
+    let Some(shading) = f.shading else { return (1.0, 0.0) };
+    let square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+    let light = if f.at_eye { ray.direction } else { f.light };
+    let dot = (g[0] * light[0] + g[1] * light[1] + g[2] * light[2]).abs();
+    let cosine = if square > ZERO_GRADIENT { (dot / square.sqrt()).min(1.0) } else { 0.0 };
+    let distance = ray.start + q * f.step;
+    let strength = 1.0 / (1.0 + distance * distance * f.falloff);
+    let highlight = if square > ZERO_GRADIENT { shading.specular * cosine.powi(shading.power as i32) } else { 0.0 };
+    ((shading.ambient * shading.ambient_light + shading.diffuse * cosine) * strength, highlight * strength)
 }
 
 /// Squared gradient [(stored units/mm)²] below which there is no direction: far less than one unit of difference.

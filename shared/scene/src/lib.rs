@@ -13,6 +13,7 @@
 pub mod breathing;
 mod error;
 pub mod hand;
+pub mod incision;
 pub mod limits;
 mod load;
 pub mod needle;
@@ -29,6 +30,7 @@ pub mod tool;
 pub use breathing::{Breathing, Signal};
 pub use error::SceneError;
 pub use hand::{GripKind, Hand};
+pub use incision::Incision;
 pub use load::TRANSFER_PRESETS;
 pub use needle::{Needle, NeedleTissue};
 pub use path::{BoxMm, ToolPose, Waypoint, Waypoints};
@@ -36,6 +38,8 @@ pub use plan::{Machine, Plan, ProcessPlan, SegmentPlan, plan};
 pub use registry::{Channel, Effect, Knob, Process};
 pub use resolve::View;
 pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
-pub use sections::{Backend, CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering};
+pub use sections::{
+    Backend, CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering, TouchedSurface,
+};
 pub use tissue::Tissue;
 pub use tool::{Approach, Device, DeviceSection, PROFILES, PathPoint, RealDevice, Shape, Tool, ToolKind};

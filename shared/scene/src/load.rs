@@ -9,6 +9,7 @@ use crate::{
     limits::{LIMITS, range_text},
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, PhantomKind, Scene, Size},
+    sections::TouchedSurface,
     suggest,
     tool::{Approach, Device, PROFILES, PathPoint, Shape, ToolKind},
 };
@@ -312,6 +313,15 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some("set `cutting = true` under [effects], or hold another tool".into());
         faults.push(document.fault("tool.kind", "a blade is good for nothing without the effect `cutting`", "needs an effect", help));
     }
+    let smooth = scene.has_effect("smooth-surface");
+    if scene.haptic.surface.is_some_and(|surface| surface != TouchedSurface::Interpolated) && !smooth {
+        let help = Some("set `smooth-surface = true` under [effects], or leave `surface` out".into());
+        faults.push(document.fault("haptic.surface", "a smooth surface needs the effect `smooth-surface`", "needs an effect", help));
+    }
+    if smooth && scene.tool.as_ref().is_some_and(|tool| tool.shape != Shape::Tip || tool.kind == ToolKind::Needle) {
+        let help = Some("use `shape = \"tip\"` and no needle, or take `smooth-surface` out".into());
+        faults.push(document.fault("effects.smooth-surface", "a smooth surface is felt with one ball only", "of no use here", help));
+    }
     let needle = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Needle);
     if needle != scene.has_effect("needle") {
         let help = Some("a needle takes `tool.kind = \"needle\"` and `needle = true` under [effects], both".into());
@@ -322,6 +332,19 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         };
         faults.push(document.fault(path, what, "one of two is missing", help));
     }
+    let incision = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Incision);
+    if incision != scene.has_effect("incision") {
+        let help = Some("an incision takes `tool.kind = \"incision\"` and `incision = true` under [effects], both".into());
+        let (path, what) = if incision {
+            ("tool.kind", "a tool that takes tissue away needs the effect `incision`")
+        } else {
+            ("effects.incision", "the effect `incision` needs a tool that takes tissue away")
+        };
+        faults.push(document.fault(path, what, "one of two is missing", help));
+    }
+    scene.incision.voxels.iter().enumerate().for_each(|(c, &n)| {
+        check_range(document, &format!("incision.voxels.{c}"), n as f64, [1.0, 64.0], "voxels", faults);
+    });
     check_needle(document, scene, faults);
     if scene.deformation.sampling_order == 2 {
         let help = Some("use 1 (trilinear) or 3 (tricubic)".into());

@@ -61,8 +61,11 @@ pub static DISPLACEMENT: Channel = Channel {
 pub static PLASTIC: Channel =
     Channel { name: "plastic", meaning: "plastic part of the displacement [mm], 3 × f32", brick_bytes: DISPLACEMENT.brick_bytes };
 /// Cut links.
-pub static CUTS: Channel =
-    Channel { name: "cuts", meaning: "links that are cut, a bit for each of three a voxel", brick_bytes: EDGE * EDGE * EDGE };
+pub static CUTS: Channel = Channel {
+    name: "cuts",
+    meaning: "links that are cut, a bit for each of three a voxel; strokes of incision",
+    brick_bytes: EDGE * EDGE * EDGE,
+};
 /// Labels.
 pub static LABELS: Channel = Channel { name: "labels", meaning: "a label for each voxel, u8", brick_bytes: EDGE * EDGE * EDGE };
 
@@ -252,6 +255,15 @@ pub static EFFECTS: &[Effect] = &[
         ..Effect::named("cutting", "a blade (`tool.kind = \"blade\"`) removes the links that it sweeps through")
     },
     Effect {
+        processes: &[Process::Deformation],
+        channels: &[&CUTS],
+        stages: &[stage(Process::Deformation, "incision", Per::Step)],
+        panels: &["incision"],
+        depends_on: &["deformation"],
+        hard_cases: &["at the border", "in air", "the same place again", "more strokes than can be taken back", "restart half-way"],
+        ..Effect::named("incision", "a tool (`tool.kind = \"incision\"`) takes away what lies below its tip; strokes are taken back")
+    },
+    Effect {
         processes: &[Process::Haptic],
         depends_on: &["contact"],
         hard_cases: &["sliding across commits", "thin walls", "poses that are no numbers"],
@@ -285,7 +297,13 @@ pub static EFFECTS: &[Effect] = &[
         ],
         ..Effect::named("needle", "a needle (`tool.kind = \"needle\"`) that bends, cuts into tissue and is held there")
     },
-    Effect::later("smooth-surface", "contact with a smooth implicit surface fitted to the voxels", &["contact"]),
+    Effect {
+        joins: &[Process::Haptic, Process::Rendering],
+        stages: &[stage(Process::Haptic, "smooth surface", Per::Tick), stage(Process::Rendering, "zoom", Per::Frame)],
+        depends_on: &["contact"],
+        hard_cases: &["constant values", "a step", "sheets of one voxel", "odd sizes", "commits under the tip"],
+        ..Effect::named("smooth-surface", "what is felt (`haptic.surface`) and seen from near is the surface of a smooth function")
+    },
     Effect::later("x-ray", "a fluoroscopic view", &[]),
     Effect {
         processes: &[Process::Rendering],

@@ -2,8 +2,9 @@
 
 use crate::{
     breathing::Breathing,
+    incision::Incision,
     needle::Needle,
-    sections::{Console, Deformation, Haptic, Memory, Rendering},
+    sections::{Console, Deformation, Haptic, Memory, Rendering, TouchedSurface},
     tissue::{self, Tissue},
     tool::{DeviceSection, Tool},
 };
@@ -162,6 +163,9 @@ pub struct Scene {
     /// the needle, for the effect of that name
     #[serde(skip_serializing_if = "is_default")]
     pub needle: Needle,
+    /// what an incision takes away, for the effect of that name
+    #[serde(skip_serializing_if = "is_default")]
+    pub incision: Incision,
     /// ChainMail and the mapper
     pub deformation: Deformation,
     /// loop, contact, limits of the device
@@ -190,6 +194,7 @@ impl Default for Scene {
             device: DeviceSection::default(),
             breathing: Breathing::default(),
             needle: Needle::default(),
+            incision: Incision::default(),
             deformation: Deformation::default(),
             haptic: Haptic::default(),
             rendering: Rendering::default(),
@@ -208,6 +213,14 @@ impl Scene {
             "contact" => self.tool.is_some(),
             "view" => true,
             _ => self.effects.get(name).is_some_and(EffectSetting::is_on),
+        }
+    }
+
+    /// The surface that is felt.
+    pub fn touched_surface(&self) -> TouchedSurface {
+        match self.haptic.surface {
+            _ if !self.has_effect("smooth-surface") => TouchedSurface::Interpolated,
+            surface => surface.unwrap_or(TouchedSurface::Smooth),
         }
     }
 

@@ -108,6 +108,18 @@ impl Default for Deformation {
     }
 }
 
+/// Which surface of the voxels is felt under the effect `smooth-surface`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TouchedSurface {
+    /// that of the interpolated voxels, as without the effect
+    Interpolated,
+    /// that of the smooth function
+    Smooth,
+    /// the same, with the normal of the local bi-cubic patch
+    Patch,
+}
+
 /// `[haptic]`: the 1 kHz loop, contact, and what the device may be given.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -128,6 +140,9 @@ pub struct Haptic {
     pub fade_s: f64,
     /// a tool move is sent when the tip has moved so far since the last one [mm], 0 to 10
     pub move_step_mm: f64,
+    /// which surface is felt under the effect `smooth-surface`: `"interpolated"`, `"smooth"` (by default) or `"patch"`
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub surface: Option<TouchedSurface>,
     /// states put out for others to draw [Hz], 1 to 1000
     pub state_hz: f64,
     /// core on which the loop is kept; by default any
@@ -148,6 +163,7 @@ impl Default for Haptic {
             ramp_s: 0.5,
             fade_s: 0.2,
             move_step_mm: 0.1,
+            surface: None,
             state_hz: 200.0,
             cpu: None,
             priority: 80,

@@ -21,6 +21,8 @@ pub enum ToolKind {
     Blade,
     /// a needle, for the effect `needle`: it bends, cuts into tissue along its axis and is held there; see `[needle]`
     Needle,
+    /// takes away what lies below its tip where it presses, for the effect `incision`; see `[incision]`. It pushes nothing
+    Incision,
 }
 
 /// What of the tool touches tissue.

@@ -5,6 +5,7 @@
 use crate::{
     block::{BLOCK, VOXELS},
     octree::Octree,
+    vector::{Task, widest},
 };
 use maille_volume::{
     BrickSource, VolumeInfo,
@@ -85,13 +86,32 @@ impl<S: BrickSource + ?Sized> Lattice for Voxels<'_, S> {
     }
     #[inline]
     fn read(&self, low: [usize; 3], extent: [usize; 3], row: usize, slice: usize, out: &mut [f32]) {
-        let layout = self.0.layout();
+        widest(Read { source: self.0, low, extent, row, slice, out });
+    }
+}
+
+/// Voxels of a box, brick by brick.
+struct Read<'a, S: ?Sized> {
+    source: &'a S,
+    low: [usize; 3],
+    extent: [usize; 3],
+    row: usize,
+    slice: usize,
+    out: &'a mut [f32],
+}
+
+impl<S: BrickSource + ?Sized> Task for Read<'_, S> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { source: bricks, low, extent, row, slice, out } = self;
+        let layout = bricks.layout();
         let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
         // brick by brick: the part of the box that each holds
         for bk in low[2] / EDGE..=(end[2] - 1) / EDGE {
             for bj in low[1] / EDGE..=(end[1] - 1) / EDGE {
                 for bi in low[0] / EDGE..=(end[0] - 1) / EDGE {
-                    let brick = self.0.brick(layout.id([bi, bj, bk]));
+                    let brick = bricks.brick(layout.id([bi, bj, bk]));
                     let b = [bi * EDGE, bj * EDGE, bk * EDGE];
                     let from: [usize; 3] = std::array::from_fn(|c| low[c].max(b[c]));
                     let to: [usize; 3] = std::array::from_fn(|c| end[c].min(b[c] + EDGE));
@@ -101,13 +121,31 @@ impl<S: BrickSource + ?Sized> Lattice for Voxels<'_, S> {
                             let target = (k - low[2]) * slice + (j - low[1]) * row + from[0] - low[0];
                             let count = to[0] - from[0];
                             let values = &brick.voxels[source..source + count];
-                            out[target..target + count].iter_mut().zip(values).for_each(|(o, &v)| *o = f32::from(v));
+                            convert(values, &mut out[target..target + count]);
                         }
                     }
                 }
             }
         }
     }
+}
+
+/// Whole vectors, the last one over what it overlaps: rows are short, and a rest taken one by one would cost as much as all before it.
+#[inline(always)]
+fn convert(values: &[i16], out: &mut [f32]) {
+    const LANES: usize = 8;
+    let eight = |at: usize, out: &mut [f32]| {
+        for (o, &v) in out[at..at + LANES].iter_mut().zip(&values[at..at + LANES]) {
+            *o = f32::from(v);
+        }
+    };
+    let count = values.len();
+    if count < LANES {
+        out.iter_mut().zip(values).for_each(|(o, &v)| *o = f32::from(v));
+        return;
+    }
+    (0..count / LANES).for_each(|n| eight(n * LANES, out));
+    eight(count - LANES, out);
 }
 
 impl Lattice for Octree {

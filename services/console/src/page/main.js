@@ -102,6 +102,7 @@ addEventListener("keydown", (e) => {
     f: () => model.edit({ sections_follow_tool: !model.view.sections_follow_tool }),
     r: () => mouse.resetCamera(),
     t: () => tool.toggle(),
+    u: () => tool.undo(),
     b: () => { if (model.facts.breathing) $("breath-hold").click(); },
     Escape: () => tool.release(),
     "[": () => model.edit({ threshold_hu: model.view.threshold_hu - 10, mode: 1 }),

@@ -11,9 +11,15 @@ export class Tool {
     this.model = model;
     this.locked = false; // held by the button or the key, not only while dragging
     $("hold").onclick = () => this.toggle();
+    $("undo").onclick = () => this.undo();
     addEventListener("visibilitychange", () => { if (document.hidden) this.release(); });
     setInterval(() => { if (model.held) this.say(); }, SAY_EVERY_MS);
   }
+
+  hello({ facts }) { $("incision").hidden = !facts.incises; }
+
+  // The last stroke of incision is taken back.
+  undo() { if (this.model.facts?.incises) this.model.link.send({ type: "undo" }); }
 
   toggle() { if (this.locked) this.release(); else if (this.take()) { this.locked = true; this.show(); } }
 

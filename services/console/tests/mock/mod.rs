@@ -73,6 +73,7 @@ impl Mock {
             transfer: "ct".into(),
             transfer_points: Vec::new(),
             has_tool: true,
+            incises: true,
             breathing: Some("synthetic".into()),
         };
         let mut view = default_view(LOW, HIGH);
