@@ -171,6 +171,7 @@ pub fn operate(name: &str, text: &str, more: &[&str], kill: bool) -> Vec<([usize
     assert!(bricks.len() >= 5, "{} commits that took something away", bricks.len());
     // four voxels of each axis lie in two bricks at most, and show in the aprons of as many more
     assert!(bricks.iter().all(|&n| n <= 27), "{bricks:?}");
+    eventually("the tool is out again", || living.tool().flags & TOOL_IN_CONTACT == 0);
     let taken = living.changed();
     let tissue = taken.iter().filter(|(_, hu)| *hu >= -300.0).count();
     println!(
@@ -183,7 +184,6 @@ pub fn operate(name: &str, text: &str, more: &[&str], kill: bool) -> Vec<([usize
         }
     );
     assert!(tissue > 100);
-    assert_eq!(living.tool().flags & TOOL_IN_CONTACT, 0, "the tool is out again");
     let frame_of = |epoch: u64| loop_until(|| frames.latest().filter(|frame| frame.header().epoch >= epoch));
     let after = picture(&frame_of(epochs), &format!("{name}-after"));
 
