@@ -256,3 +256,66 @@ fn a_mesh_of_a_surface_is_seen_where_the_surface_is_and_outlined_in_sections() {
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stderr).contains("broken.stl"));
 }
+
+/// A raw NRRD of vectors on 17³ nodes of 4 mm over the same box, from a function of position.
+fn write_field(path: &Path, mm: impl Fn([f64; 3]) -> [f32; 3]) {
+    let mut bytes =
+        b"NRRD0004\ntype: float\ndimension: 4\nspace: left-posterior-superior\nsizes: 3 17 17 17\nkinds: vector domain domain domain\n\
+        space directions: none (4,0,0) (0,4,0) (0,0,4)\nendian: little\nencoding: raw\nspace origin: (-32,-32,-32)\n\n"
+            .to_vec();
+    for n in 0..17 * 17 * 17 {
+        let x = [n % 17, n / 17 % 17, n / 289].map(|i| 4.0 * i as f64 - 32.0);
+        mm(x).iter().for_each(|c| bytes.extend(c.to_le_bytes()));
+    }
+    fs::write(path, bytes).unwrap();
+}
+
+/// Mean difference of the bytes.
+fn apart(a: &[u8], b: &[u8]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / a.len() as f64
+}
+
+#[test]
+fn a_moved_patient_is_drawn_where_it_is_by_rays_and_by_resampling_in_all_views() {
+    let folder = Folder::new("warp");
+    let [rest, moved, field] = ["rest.nrrd", "moved.nrrd", "field.nrrd"].map(|name| folder.path(name));
+    write_nrrd(&rest, |x| ball(x, [-4.0, 2.0, 0.0], 14.0));
+    write_nrrd(&moved, |x| ball(x, [4.0, 2.0, -5.0], 14.0));
+    write_field(&field, |_| [8.0, 0.0, -5.0]);
+    let field = field.to_str().unwrap();
+    for view in [&["--view", "axial"][..], &["--view", "sagittal"], &["--view", "xray"], &["--iso", "0"], &[]] {
+        let options = [&["--size", "120x96", "--threads", "2"][..], view].concat();
+        let there = picture(&moved, &folder.path("there.png"), &options).2;
+        let still = picture(&rest, &folder.path("still.png"), &options).2;
+        let through =
+            |scheme| picture(&rest, &folder.path("warped.png"), &[&options[..], &["--warp", field, "--warp-scheme", scheme]].concat()).2;
+        for scheme in ["lattice", "resample"] {
+            let off = apart(&through(scheme), &there);
+            println!("{view:?} {scheme}: {off:.3} of 255 from the patient who lies there; unmoved {:.3}", apart(&still, &there));
+            assert!(off < 0.6 && 6.0 * off < apart(&still, &there), "{view:?} {scheme}");
+        }
+    }
+    let output = maille(&[rest.to_str().unwrap(), "-o", folder.path("no.png").to_str().unwrap(), "--warp", rest.to_str().unwrap()]);
+    assert_eq!(output.status.code(), Some(1), "a volume is no field");
+}
+
+#[test]
+fn an_overlay_colours_what_moves_by_its_direction_in_sections_and_in_3d() {
+    let folder = Folder::new("overlay");
+    let [volume, field] = ["ball.nrrd", "field.nrrd"].map(|name| folder.path(name));
+    write_nrrd(&volume, |x| ball(x, [0.0; 3], 20.0));
+    // up on the patient's left, down on the right
+    write_field(&field, |x| [0.0, 0.0, 12.0 * (x[0] / 8.0).clamp(-1.0, 1.0) as f32]);
+    let field = field.to_str().unwrap();
+    for view in [&["--view", "coronal"][..], &["--iso", "0"]] {
+        let options = [&["--size", "100x100"][..], view].concat();
+        let plain = picture(&volume, &folder.path("plain.png"), &options).2;
+        let (_, _, pixels) = picture(&volume, &folder.path("tinted.png"), &[&options[..], &["--overlay", field]].concat());
+        let at = |x: usize| [0, 1, 2].map(|c| pixels[3 * (50 * 100 + x) + c]);
+        // seen from the front, the patient's left is the picture's right
+        let near = |a: [u8; 3], b: [u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(b) <= 3);
+        assert!(near(at(65), [128, 255, 0]) && near(at(35), [128, 0, 255]), "{view:?}: {:?} {:?}", at(65), at(35));
+        let middle = 3 * (50 * 100 + 50);
+        assert!(apart(&pixels[middle..middle + 3], &plain[middle..middle + 3]) < 40.0, "where little moves little is coloured");
+    }
+}

@@ -118,7 +118,7 @@ fn folds(determinant: &ScalarField) -> Image {
 }
 
 /// Reads a field that can be worked with: three finite numbers a voxel, two nodes or more along every axis.
-fn read_field(path: &Path) -> Result<VectorField, Failure> {
+pub(super) fn read_field(path: &Path) -> Result<VectorField, Failure> {
     let reading = read(path, &ReadOptions::default()).map_err(|e| Failure::Refused(e.to_string()))?;
     for notice in &reading.notices {
         eprintln!("maille: {}: {notice}", path.display());

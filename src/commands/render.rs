@@ -1,16 +1,17 @@
 //! `maille render`: one picture of a volume, or of a scene at rest, without starting any process.
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, invert::read_field};
 use clap::{Args as ClapArgs, ValueEnum};
 use maille_phantom::{Kind, Phantom};
 use maille_raycast::{
-    Camera, Extras, Geometry, Labels, Light, MeshView, Overlay, Picture, Plane, Preset, Probe, Section, Settings, Skip, SlabMode, Step,
-    Transfer, Ultrasound, render_extra, section_with, ultrasound,
+    Camera, Extras, Geometry, Labels, Light, MeshView, Motion, Overlay, Picture, Plane, Preset, Probe, Section, Settings, Shown, Skip,
+    SlabMode, Step, Transfer, Ultrasound, Warp, WarpOptions, overlay_section, overlay_view, render_extra, section_with, ultrasound,
 };
 use maille_raycast_gpu::{Choice, Gpu, GpuError, Renderer};
 use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
 use maille_surface::{Mesh, read_mesh};
-use maille_volume::{BrickSource as _, BrickedVolume, Volume, io};
+use maille_volume::{BrickSource as _, BrickedVolume, Sampler, Volume, io};
+use rayon::prelude::*;
 use std::{
     fs::File,
     io::BufWriter,
@@ -102,6 +103,21 @@ struct More {
     /// a mesh among the voxels, in section views its outline: .stl, .ply or .obj, LPS millimetres; may be given several times
     #[arg(long, value_name = "MESH")]
     mesh: Vec<PathBuf>,
+    /// a displacement field, rest → moved in mm, as `maille deform` and `maille motion eval` write it: show the patient as moved by it
+    #[arg(long, value_name = "FIELD")]
+    warp: Option<PathBuf>,
+    /// how the moved patient is drawn: by rays through the field's inverse, or by resampling the whole volume first
+    #[arg(long, value_enum, default_value_t = WarpScheme::Lattice, requires = "warp")]
+    warp_scheme: WarpScheme,
+    /// how far from its place anything of the moved patient may be drawn
+    #[arg(long, value_name = "MM", value_parser = positive, default_value_t = 0.05, requires = "warp")]
+    warp_tolerance: f64,
+    /// a displacement field as colours over what is seen: hue by its direction in the picture, strength by its length
+    #[arg(long, value_name = "FIELD")]
+    overlay: Option<PathBuf>,
+    /// length of a displacement whose colour is opaque
+    #[arg(long, value_name = "MM", value_parser = positive, default_value_t = 10.0, requires = "overlay")]
+    overlay_mm: f64,
     /// how deep an ultrasound probe looks [default: 120]
     #[arg(long, value_name = "MM", value_parser = positive)]
     depth: Option<f64>,
@@ -128,6 +144,12 @@ enum View {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum WarpScheme {
+    Lattice,
+    Resample,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Slab {
     Mean,
     Max,
@@ -145,8 +167,17 @@ pub fn run(args: &Args) -> Outcome {
         return Err(Failure::Usage("--threads and --time need at least 1".into()));
     }
     let (volume, scene) = load(&args.input)?;
-    let bricks = BrickedVolume::from_volume(&volume);
+    let mut bricks = BrickedVolume::from_volume(&volume);
     drop(volume);
+    // colours are those of the patient at rest, also where that patient is resampled
+    let moved = args.more.warp.as_deref().map(|path| warp(path, &bricks, args.more.warp_tolerance)).transpose()?;
+    if let (Some(inverse), WarpScheme::Resample) = (&moved, args.more.warp_scheme) {
+        bricks = resampled(&bricks, inverse);
+    }
+    let warp = moved.as_ref().filter(|_| args.more.warp_scheme == WarpScheme::Lattice);
+    let colours = args.more.overlay.as_deref().map(motion).transpose()?;
+    let moment = colours.as_ref().map(|motion| motion.moment(&[1.0])).transpose().map_err(|e| Failure::Refused(e.to_string()))?;
+    let shown = moment.as_ref().map(|field| Shown { field, warp: moved.as_ref(), opaque_mm: args.more.overlay_mm });
     let plane = match args.view {
         View::ThreeD | View::Xray | View::Ultrasound => None,
         View::Axial => Some(Plane::Axial),
@@ -155,7 +186,9 @@ pub fn run(args: &Args) -> Outcome {
     };
     let sizes = scene.as_ref().map(|s| if plane.is_some() { s.rendering.section_size } else { s.rendering.size });
     let [width, height] = args.size.or(sizes).unwrap_or([1024, 768]);
-    let mut picture = Picture::new(width, height);
+    // where a 3D view is coloured it must be known how far away things are
+    let depth = shown.is_some() && plane.is_none();
+    let mut picture = if depth { Picture::with_depth(width, height) } else { Picture::new(width, height) };
     let labels = args.more.labels.as_deref().map(|path| labels(path, &bricks)).transpose()?;
     let meshes = args.more.mesh.iter().map(|path| mesh(path)).collect::<Result<Vec<_>, _>>()?;
     let views: Vec<MeshView<'_>> = meshes.iter().zip(MESH_COLORS.into_iter().cycle()).map(|(m, color)| mesh_view(m, color)).collect();
@@ -173,19 +206,22 @@ pub fn run(args: &Args) -> Outcome {
     let times = match plane {
         Some(plane) => {
             let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
-            let overlay = Overlay { labels: labels.as_ref(), geometry: Some(&geometry), ..Overlay::default() };
+            let overlay = Overlay { warp, labels: labels.as_ref(), geometry: Some(&geometry), ..Overlay::default() };
             let mut outcome = Ok(());
             let times = timed(frames, || match &mut gpu {
                 None => pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)),
                 Some(gpu) => outcome = gpu.section_with(&bricks, &section_of, &overlay, &mut picture).map(drop),
             });
             outcome.map_err(|e| refused(&e))?;
+            if let Some(shown) = &shown {
+                overlay_section(&mut picture, &section_of, bricks.info(), shown);
+            }
             times
         }
         None if args.view == View::Ultrasound => {
             let fan = fan(args, scene.as_ref(), &bricks)?;
             let mut outcome = Ok(());
-            let times = timed(frames, || outcome = pool.install(|| ultrasound(&bricks, &fan, None, &mut picture)));
+            let times = timed(frames, || outcome = pool.install(|| ultrasound(&bricks, &fan, warp, &mut picture)));
             outcome.map_err(Failure::Usage)?;
             times
         }
@@ -198,7 +234,7 @@ pub fn run(args: &Args) -> Outcome {
             if args.more.smooth && gpu.is_some() {
                 return Err(Failure::Refused("--smooth is drawn by the processor: leave `--backend gpu` out".into()));
             }
-            let extras = Extras { labels: labels.as_ref(), barrel, geometry: Some(&geometry), zoom, ..Extras::default() };
+            let extras = Extras { warp, labels: labels.as_ref(), barrel, geometry: Some(&geometry), zoom, ..Extras::default() };
             let mut outcome = Ok(());
             let times = timed(frames, || {
                 let drawn = match &mut gpu {
@@ -212,6 +248,9 @@ pub fn run(args: &Args) -> Outcome {
                 }
             });
             outcome?;
+            if let Some(shown) = &shown {
+                overlay_view(&mut picture, &camera, barrel, bricks.info(), shown);
+            }
             times
         }
     };
@@ -310,6 +349,49 @@ fn labels(path: &Path, bricks: &BrickedVolume) -> Result<Labels, Failure> {
     };
     let voxels = volume.voxels.iter().map(label).collect::<Result<_, _>>()?;
     Labels::new(volume.info.grid.size, voxels).map_err(fault)
+}
+
+/// A displacement field from a file.
+fn motion(path: &Path) -> Result<Motion, Failure> {
+    Motion::single(&read_field(path)?).map_err(|e| Failure::Refused(format!("{}: {e}", path.display())))
+}
+
+/// The inverse of a field, on a lattice as fine as the tolerance wants it, down to half of the field's own.
+fn warp(path: &Path, bricks: &BrickedVolume, tolerance_mm: f64) -> Result<Warp, Failure> {
+    let motion = motion(path)?;
+    let finest = 0.5 * motion.grid().min_spacing();
+    let mut pitch_mm = 8.0f64.max(finest);
+    loop {
+        let mut warp = Warp::new(bricks.info(), WarpOptions { tolerance_mm: tolerance_mm as f32, pitch_mm: pitch_mm as f32 });
+        let report = warp.update(bricks.info(), &motion, &[1.0]).map_err(|e| Failure::Refused(format!("{}: {e}", path.display())))?;
+        let within = f64::from(report.error_mm) <= tolerance_mm;
+        if within || pitch_mm <= finest {
+            if report.unsettled > 0 || !within {
+                let (worst, lost) = (report.error_mm, report.unsettled);
+                eprintln!(
+                    "maille: {}: drawn to within {worst:.3} mm, {lost} of {} places without an inverse",
+                    path.display(),
+                    report.nodes
+                );
+            }
+            return Ok(warp);
+        }
+        pitch_mm = (0.5 * pitch_mm).max(finest);
+    }
+}
+
+/// The volume as moved, on its own grid; what comes from outside is its smallest value.
+fn resampled(bricks: &BrickedVolume, warp: &Warp) -> BrickedVolume {
+    let (info, sampler) = (bricks.info().clone(), Sampler::new(bricks));
+    let [nx, ny, _] = info.grid.size;
+    let lowest = bricks.to_volume().voxels.iter().copied().min().unwrap_or(0);
+    let voxels = (0..info.grid.voxel_count()).into_par_iter().map(|n| {
+        let rest = warp.rest_index([n % nx, n / nx % ny, n / (nx * ny)].map(|c| c as f32)).map(f64::from);
+        let stored = |hu: f64| ((hu - info.rescale.intercept) / info.rescale.slope).round().clamp(-32768.0, 32767.0) as i16;
+        sampler.value(info.grid.world_from_index(rest)).map_or(lowest, stored)
+    });
+    let voxels = voxels.collect();
+    BrickedVolume::from_volume(&Volume::new(info.grid.clone(), info.rescale, voxels))
 }
 
 /// Colours of meshes, in turn: organs and instruments as atlases have them.

@@ -27,6 +27,8 @@ pub(crate) struct Composer {
     pictures: [Picture; 5],
     /// how finely the next 3D view is drawn
     pub quality: Quality,
+    /// displacement whose colour over a section is opaque [mm]
+    overlay_mm: Option<f64>,
     /// who draws
     pub backend: Backend,
     /// room for a 3D view of fewer pixels
@@ -45,7 +47,16 @@ impl Composer {
         let [fw, fh] = if scene.has_effect("ultrasound") { scene.rendering.section_size } else { [0, 0] };
         let pictures = [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)];
         let zoom = scene.has_effect("smooth-surface");
-        Self { skip: None, pictures, quality: Quality::FULL, backend: Backend::default(), coarse: Picture::new(0, 0), view_ns: 0, zoom }
+        Self {
+            skip: None,
+            pictures,
+            overlay_mm: scene.rendering.overlay_mm,
+            quality: Quality::FULL,
+            backend: Backend::default(),
+            coarse: Picture::new(0, 0),
+            view_ns: 0,
+            zoom,
+        }
     }
 
     /// Bytes of a frame.
@@ -103,7 +114,7 @@ impl Composer {
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
-            let overlay = Overlay { warp, geometry: Some(&bodies), ..Overlay::default() };
+            let overlay = Overlay { warp, displacement_mm: self.overlay_mm, geometry: Some(&bodies), ..Overlay::default() };
             self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
         if fan.width > 0 {

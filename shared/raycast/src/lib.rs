@@ -48,7 +48,7 @@ pub use budget::{FrameBudget, Quality};
 pub use camera::Camera;
 pub use geometry::{Capsule, Geometry, MeshView, carry, vertex_normals};
 pub use labels::Labels;
-pub use overlay::tint_displacement;
+pub use overlay::{Shown, overlay_section, overlay_view};
 pub use picture::Picture;
 pub use render::{Extras, Kernel, RenderError, render, render_extra, render_with};
 pub use section::{Overlay, Plane, Section, SlabMode, section, section_with};

@@ -53,7 +53,7 @@ pub fn cast_tile<S: BrickSource + ?Sized>(
     ends: Option<&Ends<'_>>,
     mut warp: Option<&mut Tile<'_>>,
     area: Area,
-    put: impl FnMut(usize, usize, Seen),
+    put: impl FnMut(Part),
 ) {
     let Area { first, size, clear } = area;
     #[cfg(target_arch = "x86_64")]
@@ -84,17 +84,53 @@ fn tile<L: Lanes>(
     lanes: L,
     first: [usize; 2],
     size: [usize; 2],
-    mut put: impl FnMut(usize, usize, Seen),
+    mut put: impl FnMut(Part),
     mut cast: impl FnMut(L, usize, usize) -> walk::Packet,
 ) {
-    for y in (first[1]..first[1] + size[1]).step_by(L::DOWN) {
-        for x in (first[0]..first[0] + size[0]).step_by(L::ACROSS) {
-            let seen = cast(lanes, x, y);
-            for lane in 0..L::COUNT {
-                let (px, py) = (x + lane % L::ACROSS, y + lane / L::ACROSS);
-                if px < first[0] + size[0] && py < first[1] + size[1] {
-                    put(px, py, seen.lane(lane));
-                }
+    let end: [usize; 2] = std::array::from_fn(|c| first[c] + size[c]);
+    for y in (first[1]..end[1]).step_by(L::DOWN) {
+        for x in (first[0]..end[0]).step_by(L::ACROSS) {
+            let size = [L::ACROSS.min(end[0] - x), L::DOWN.min(end[1] - y)];
+            put(Part { seen: cast(lanes, x, y), across: L::ACROSS, first: [x, y], size });
+        }
+    }
+}
+
+/// What a packet saw, and where in the picture.
+pub struct Part {
+    seen: walk::Packet,
+    /// lanes of a row
+    across: usize,
+    /// first pixel
+    pub first: [usize; 2],
+    /// pixels across and down that belong to the tile
+    size: [usize; 2],
+}
+
+impl Part {
+    /// Every pixel by itself.
+    pub fn each(&self, put: &mut impl FnMut(usize, usize, Seen)) {
+        for row in 0..self.size[1] {
+            for x in 0..self.size[0] {
+                put(self.first[0] + x, self.first[1] + row, self.seen.lane(row * self.across + x));
+            }
+        }
+    }
+
+    /// Colours before what is behind them, and depth, into rows of `width` pixels that begin at the first pixel: what [`each`](Self::each) with
+    /// [`write_pixel`](crate::render::write_pixel) does, for all lanes at once.
+    pub fn write(&self, behind: [f32; 3], rgb: &mut [u8], depth: Option<&mut [f32]>, width: usize) {
+        let bytes = self.seen.bytes(behind);
+        let [columns, rows] = self.size;
+        for row in 0..rows {
+            let lanes = row * self.across..row * self.across + columns;
+            for (pixel, lane) in rgb[3 * row * width..].as_chunks_mut::<3>().0.iter_mut().zip(lanes) {
+                *pixel = bytes.map(|channel| channel[lane]);
+            }
+        }
+        if let Some(depth) = depth {
+            for row in 0..rows {
+                (0..columns).for_each(|x| depth[row * width + x] = self.seen.lane(row * self.across + x).depth);
             }
         }
     }

@@ -194,7 +194,21 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                 Some(lanes) => {
                     let (first, size) = ([x0, n * BAND], [columns, rows]);
                     let clear = if tile.is_none() { beam::clear(&frame, skip, first, size) } else { 0.0 };
-                    packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), Area { first, size, clear }, put);
+                    if clear == f32::INFINITY && solid.is_none() {
+                        // nothing at all
+                        let nothing = Seen { color: [0.0; 3], transmittance: 1.0, depth: f32::INFINITY };
+                        (0..rows).for_each(|row| (x0..x0 + columns).for_each(|x| put(x, n * BAND + row, nothing)));
+                        continue;
+                    }
+                    let area = Area { first, size, clear };
+                    if solid.is_some() {
+                        packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), area, |seen| seen.each(&mut put));
+                    } else {
+                        packet::cast_tile(lanes, &stage, None, tile.as_mut(), area, |seen| {
+                            let at = (seen.first[1] - n * BAND) * width + seen.first[0];
+                            seen.write(frame.background, &mut rgb[3 * at..], depth.as_deref_mut().map(|d| &mut d[at..]), width);
+                        });
+                    }
                 }
                 None => (n * BAND..n * BAND + rows).for_each(|y| {
                     (x0..x0 + columns).for_each(|x| {

@@ -48,6 +48,19 @@ impl Packet {
     }
 }
 
+impl Packet {
+    /// Red, green and blue bytes of all lanes before what is behind them.
+    #[inline]
+    pub fn bytes(&self, behind: [f32; 3]) -> [[u8; MOST]; 3] {
+        std::array::from_fn(|c| {
+            std::array::from_fn(|n| {
+                let v = self.color[c][n] + self.transmittance[n] * behind[c];
+                (v * 255.0 + 0.5).clamp(0.0, 255.0) as u8
+            })
+        })
+    }
+}
+
 /// Rays of a packet; fields as in [`crate::frame::Ray`].
 struct Rays<L: Lanes> {
     origin: [L::Float; 3],

@@ -92,6 +92,7 @@ pub static LIMITS: &[Limit] = limits! {
     rendering.distance: 0.05 ..= 10 [""] |s| Some(s.rendering.distance);
     rendering.step: 0.05 ..= 4 ["voxels"] |s| Some(s.rendering.step);
     rendering.opacity_end: 0.5 ..= 1 [""] |s| Some(s.rendering.opacity_end);
+    rendering.overlay_mm: 0.1 ..= 100 ["mm"] |s| s.rendering.overlay_mm;
     rendering.threads: 1 ..= 256 [""] |s| s.rendering.threads.map(|n| n as f64);
     console.jpeg_quality: 10 ..= 100 [""] |s| Some(s.console.jpeg_quality.into());
     memory.spare_mib: 1 ..= 1048576 ["MiB"] |s| s.memory.spare_mib.map(|n| n as f64);

@@ -252,6 +252,9 @@ pub struct Rendering {
     pub opacity_end: f64,
     /// window of the sections [HU]: centre and width
     pub section_window_hu: [f64; 2],
+    /// in a patient who breathes, colour sections by displacement: hue by its direction in the plane, this length [mm] is opaque; by default not
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub overlay_mm: Option<f64>,
     /// threads of the process; by default a share of the machine's cores
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<usize>,
@@ -281,6 +284,7 @@ impl Default for Rendering {
             shading: true,
             opacity_end: 0.99,
             section_window_hu: [50.0, 800.0],
+            overlay_mm: None,
             threads: None,
         }
     }
