@@ -6,6 +6,7 @@
 //! - `{"type":"tool","taken":true,"target_mm":[x,y,z]}` while the hand holds the tool, at least every 250 ms;
 //!   `{"type":"tool","taken":false}` lets it go;
 //! - `{"type":"breath","held":true,"level":0.4}`: the breath is held or goes on, and the slider leads it or (`null`) nobody does;
+//! - `{"type":"effect","name":"sections","on":false}`: an effect that may be switched live is switched;
 //! - `{"type":"ack","frame":n}` after frame n has been drawn: the next one is sent only then.
 //!
 //! **Server → page**, JSON text: one [`Hello`] first (and again when the patient or the scene changes), then a [`State`] twenty
@@ -50,6 +51,8 @@ pub enum Request {
     Tool(ToolRequest),
     /// hold, lead or let go the breath
     Breath(BreathRequest),
+    /// switch an effect
+    Effect(EffectRequest),
     /// a frame was drawn
     Ack {
         /// its number
@@ -124,6 +127,16 @@ pub struct BreathRequest {
     pub held: bool,
     /// the level that the slider asks for while it leads
     pub level: Option<f64>,
+}
+
+/// An effect is switched.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EffectRequest {
+    /// its name in the registry
+    pub name: String,
+    /// whether it shall be on
+    pub on: bool,
 }
 
 /// What does not change while the run lasts.
@@ -203,6 +216,10 @@ pub struct State<'a> {
     pub commit: Option<CommitSummary>,
     /// how the patient breathes, where one does
     pub breath: Option<crate::breath::Breath>,
+    /// effects that may be switched, and whether they are on
+    pub effects: Vec<(&'static str, bool)>,
+    /// what the governor gave up, knob and setting, where the scene leaves its accuracy to it
+    pub given_up: Option<Vec<(&'static str, f64)>>,
     /// requests refused since the start
     pub refused: u64,
     /// pages connected

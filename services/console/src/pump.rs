@@ -137,6 +137,11 @@ impl<F: Feed> Pump<F> {
                         self.hub.refuse();
                     }
                 }
+                Event::Request(_, Request::Effect(request)) => {
+                    if !self.feed.switch(&request.name, request.on) {
+                        self.hub.refuse();
+                    }
+                }
                 Event::Request(_, Request::Ack { .. }) => {}
                 Event::Left(page) if self.holder.as_ref().is_some_and(|h| h.page == page) => self.release(),
                 Event::Left(_) => {}
@@ -237,6 +242,8 @@ impl<F: Feed> Pump<F> {
                 rates: self.rates,
                 commit: self.commit.as_ref().map(commit_seen),
                 breath,
+                effects: self.feed.switches(),
+                given_up: self.feed.given_up(),
                 refused: self.hub.refused.load(Relaxed),
                 pages: self.hub.pages.load(Relaxed),
             };
