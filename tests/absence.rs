@@ -1,8 +1,8 @@
 //! What a scene does not call for costs nothing, and is not there.
 //!
 //! *Instructions*: valgrind's callgrind counts what `maille turns` does in ticks, steps and frames, once with an effect registered but not asked for
-//! and once with it taken out of the registry. Both must be the same within 0.1 %; and an effect that is asked for must show, or the count would
-//! prove nothing. Without valgrind the tests skip, loudly; with CI set they fail.
+//! and once with it taken out of the registry. Both must be the same within 0.1 %, beside what four runs of the very same differ by (memory lies elsewhere in
+//! each; printed); and an effect that is asked for must show, or the count would prove nothing. Without valgrind the tests skip, loudly; with CI set they fail.
 //!
 //! *Processes and memory*: a scene of a volume with sections runs as one process, which maps no displacement and reaches no code of haptics,
 //! deformation or breathing.
@@ -118,12 +118,21 @@ fn an_effect_that_is_registered_and_not_asked_for_costs_no_instruction() {
     let counted = count(&scratch, &["--leave-out"], &scenes.each_ref().map(PathBuf::as_path));
     let registered: BTreeMap<(&str, &str), &Counted> =
         counted.iter().filter(|c| c.left_out == "-").map(|c| ((c.scene.as_str(), c.kind.as_str()), c)).collect();
+    let mut spread: BTreeMap<(&str, &str), f64> = BTreeMap::new();
+    for c in counted.iter().filter(|c| c.left_out == "=") {
+        let key = (c.scene.as_str(), c.kind.as_str());
+        let seen = spread.entry(key).or_default();
+        *seen = seen.max((registered[&key].instructions / c.instructions - 1.0).abs());
+    }
+    println!("spread of the very same: {spread:?}");
+    assert!(spread.values().all(|s| *s < 3.0 * NOTHING), "what is the same does not take the same: {spread:?}");
     let mut worst: BTreeMap<&str, [f64; 3]> = BTreeMap::new();
-    for c in counted.iter().filter(|c| c.left_out != "-") {
+    for c in counted.iter().filter(|c| !["-", "="].contains(&c.left_out.as_str())) {
         let with = registered[&(c.scene.as_str(), c.kind.as_str())];
         assert_eq!(with.turns, c.turns, "{} {}: not the same turns", c.scene, c.kind);
         assert!(c.turns > 0.0 && c.instructions > 1e4, "{} {}: nothing was done", c.scene, c.kind);
-        let difference = (with.instructions / c.instructions - 1.0).abs();
+        let same = spread[&(c.scene.as_str(), c.kind.as_str())];
+        let difference = ((with.instructions / c.instructions - 1.0).abs() - same).max(0.0);
         let place = ["tick", "step", "frame"].iter().position(|k| *k == c.kind).expect("a kind of turn");
         let seen = &mut worst.entry(c.left_out.as_str()).or_default()[place];
         *seen = seen.max(difference);

@@ -27,7 +27,10 @@ use maille_raycast::FrameBudget;
 use maille_scene::{Accuracy, BoxMm, Machine, Plan, Scene, registry::live_knob};
 use maille_store::Reader;
 use maille_transport::{Domain, FramePublisher, Life, Node, Stopwatch, Untimed, monotonic_ns, timed};
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::{Arc, atomic::Ordering::Relaxed},
+    time::Duration,
+};
 use thiserror::Error;
 
 /// Why the rendering process could not start.
@@ -100,6 +103,8 @@ fn frames<W: Stopwatch + Send>(
     let mut bodies = Vec::new();
     // only a scene whose accuracy is the governor's looks for what that turned
     let mut knobs_seen = (scene.accuracy == Accuracy::Auto).then_some(0u64);
+    // a run whose stages are timed draws every frame, also of what stands: it wants to know what one takes
+    let every = life.control().timed.load(Relaxed) != 0;
     // only a scene that calls for something that can be switched looks whether it was
     let mut switches_seen = plan.can_switch(maille_scene::Process::Rendering).then_some(0u64);
     // and there it is the governor that says how finely is drawn, by measured fronts, for every frame
@@ -141,7 +146,7 @@ fn frames<W: Stopwatch + Send>(
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
         let asked = (view.generation(), view.turns());
         let seen = (reader.epoch(), asked, tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
-        let moving = shown != Some(seen);
+        let moving = every || shown != Some(seen);
         shown = Some(seen);
         let quality = if adapt { budget.next(moving) } else { moving.then_some(view.quality()) };
         let Some(quality) = quality else {

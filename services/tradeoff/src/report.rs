@@ -72,7 +72,9 @@ impl Front {
             let same: Vec<_> =
                 curve.subjects.iter().filter_map(|s| s.points.iter().find(|p| p.line == used && p.value == point.value)).collect();
             let mean = |of: &dyn Fn(&crate::Point) -> f64| same.iter().map(|p| of(p)).sum::<f64>() / same.len() as f64;
-            points.push(FrontPoint { value, time: mean(&|p| p.ratio.median), error: mean(&|p| p.error) });
+            // more digits than these mean nothing, and a file of them can be read
+            let round = |v: f64| format!("{v:.4e}").parse().unwrap_or(v);
+            points.push(FrontPoint { value, time: round(mean(&|p| p.ratio.median)), error: round(mean(&|p| p.error)) });
         }
         points.sort_by(|a, b| a.time.total_cmp(&b.time).then(a.error.total_cmp(&b.error)));
         let mut best = f64::INFINITY;
@@ -164,12 +166,7 @@ impl Report {
 
     /// The fronts alone, with what they were measured on and by which command, a line each: the file that a governor reads.
     pub fn fronts_json(&self) -> String {
-        let rounded = |f: &Front| {
-            let round = |v: f64| format!("{v:.4e}").parse().unwrap_or(v);
-            let points = f.points.iter().map(|p| FrontPoint { value: p.value, time: round(p.time), error: round(p.error) }).collect();
-            Front { points, ..f.clone() }
-        };
-        let lines: Vec<String> = self.fronts.iter().map(|f| format!("    {}", line(&rounded(f)))).collect();
+        let lines: Vec<String> = self.fronts.iter().map(|f| format!("    {}", line(f))).collect();
         format!(
             "{{\n  \"command\": {},\n  \"processor\": {},\n  \"fronts\": [\n{}\n  ]\n}}\n",
             line(&self.command),

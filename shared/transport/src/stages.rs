@@ -2,7 +2,7 @@
 //!
 //! A loop is generic over its [`Stopwatch`]. The one of a usual run, [`Untimed`], is of no size and does nothing, so that no clock is read and no
 //! branch taken; [`Timed`] reads the clock after each stage and adds to the service's cell. Which one a process has is decided once, when it starts
-//! ([`timed`]): `maille run --stages`, and the rehearsal of `maille check`.
+//! ([`timed`]): `maille run --stages`, the rehearsal of `maille check`, and `maille effects`.
 
 use crate::{ControlMap, Domain, Life, TransportError, monotonic_ns};
 use maille_contract::{Role, control::STAGES};
