@@ -37,6 +37,8 @@ enum Command {
     Effects(commands::effects::Args),
     #[command(hide = true)]
     LatencyHelper(commands::latency::HelperArgs),
+    #[command(hide = true)]
+    Turns(commands::turns::Args),
     Doctor(commands::doctor::Args),
     Clean(commands::clean::Args),
 }
@@ -58,6 +60,7 @@ fn main() -> ExitCode {
         Command::Tradeoff(args) => commands::tradeoff::run(&args),
         Command::Effects(args) => commands::effects::run(&args),
         Command::LatencyHelper(args) => commands::latency::help(&args),
+        Command::Turns(args) => commands::turns::run(&args),
         Command::Doctor(args) => commands::doctor::run(&args),
         Command::Clean(args) => commands::clean::run(&args),
     };

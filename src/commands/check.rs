@@ -1,6 +1,9 @@
-//! `maille check`: the plan of a scene, printed.
+//! `maille check`: the plan of a scene, printed, and what it costs on this machine.
 
-use super::{Failure, Outcome};
+use super::{
+    Failure, Outcome,
+    rehearse::{Costs, rehearse},
+};
 use maille_breathing::Prepared;
 use maille_phantom::{Kind, Phantom};
 use maille_scene::{
@@ -9,7 +12,7 @@ use maille_scene::{
     registry::Knob,
 };
 use maille_store::{StorePlan, StoreSizes};
-use maille_supervisor::memory::shared_memory_space;
+use maille_supervisor::{fronts::Fronts, memory::shared_memory_space};
 use maille_volume::{Rescale, Volume, VolumeInfo, io};
 use serde_json::{Value, json};
 use std::{io::Write as _, path::PathBuf};
@@ -21,12 +24,16 @@ macro_rules! say {
     }};
 }
 
-/// Print the plan of a scene: processes, effects, memory, rates
+/// Print the plan of a scene and what it costs here: processes, effects, memory, rates
 ///
-/// Reads the scene and its volume, starts nothing, and prints what `maille run` would start: each process with its rate,
+/// Reads the scene and its volume and prints what `maille run` would start: each process with its rate,
 /// its threads and the work in one turn of its loop; the effects that are on; each segment of shared memory with its size, and what
 /// /dev/shm has free; where the tool's way meets the patient; and every knob with its value and range. What is not
 /// printed will not be there.
+///
+/// Then the scene runs for a few seconds, without a page and without a real device, its stages timed: printed are the time of each loop's turn and of its
+/// stages on this machine, the headroom in each loop's deadline, and, where a rate will not hold, which knob to turn or which effect to switch
+/// off. --no-measure leaves this out and starts nothing.
 ///
 /// A fault in the scene is shown on its line, with what was probably meant; the exit status is then 1, and also where
 /// the shared memory would not suffice.
@@ -40,6 +47,12 @@ pub struct Args {
     /// Motion model in place of the scene's own
     #[arg(long, value_name = "MODEL")]
     motion: Option<PathBuf>,
+    /// Measured fronts that advice is taken from, in place of the program's own
+    #[arg(long, value_name = "FILE")]
+    fronts: Option<PathBuf>,
+    /// Measure nothing: the plan alone
+    #[arg(long)]
+    no_measure: bool,
     /// Print one JSON object on standard output and nothing else there
     #[arg(long)]
     json: bool,
@@ -66,10 +79,17 @@ pub fn run(args: &Args) -> Outcome {
     }
     let way = scene.resolve_path(&BoxMm::of(grid), |at| patient.value(at)).map_err(report)?;
     let memory = Memory::of(&plan, patient.info());
+    let fits = memory.free.is_none_or(|free| free >= memory.total());
     if args.json {
-        say!("{}", json_of(&scene, &patient, &plan, breath.as_ref(), way.as_ref(), &memory));
+        let mut json = json_of(&scene, &patient, &plan, breath.as_ref(), way.as_ref(), &memory);
+        json["measured"] = measured(args, &scene, &plan, way.as_ref(), fits)?.map_or(Value::Null, |costs| costs.to_json());
+        say!("{json}");
     } else {
         print_text(&scene, &patient, &plan, breath.as_ref(), way.as_ref(), &memory);
+        if let Some(costs) = measured(args, &scene, &plan, way.as_ref(), fits)? {
+            say!("");
+            costs.lines().iter().for_each(|line| say!("{line}"));
+        }
     }
     match memory.free {
         Some(free) if free < memory.total() => Err(Failure::Refused(format!(
@@ -80,6 +100,15 @@ pub fn run(args: &Args) -> Outcome {
         ))),
         _ => Ok(()),
     }
+}
+
+/// What the scene costs here, unless nobody wants to know or it cannot run.
+fn measured(args: &Args, scene: &Scene, plan: &Plan, way: Option<&Waypoints>, fits: bool) -> Result<Option<Costs>, Failure> {
+    if args.no_measure || !fits {
+        return Ok(None);
+    }
+    let fronts = Fronts::open(args.fronts.as_deref()).map_err(|e| Failure::Refused(e.to_string()))?;
+    rehearse(scene, plan, way, &fronts).map(Some).map_err(Failure::Refused)
 }
 
 /// The volume, as far as a plan needs it: a made patient is asked point by point and never made.

@@ -14,11 +14,13 @@ pub mod info;
 pub mod invert;
 pub mod latency;
 pub mod motion;
+pub mod rehearse;
 pub mod render;
 pub mod run;
 pub mod service;
 pub mod surface;
 pub mod tradeoff;
+pub mod turns;
 
 /// Why a command ended without doing what was asked.
 #[derive(Debug)]

@@ -32,6 +32,12 @@ pub struct Args {
     /// What moves the tool: path, path:FILE (way points), sim (a simulated hand), console (the page)
     #[arg(long, value_name = "DEVICE", value_parser = device)]
     device: Option<Device>,
+    /// Time each stage of the services' loops, for the report
+    #[arg(long)]
+    stages: bool,
+    /// Measured fronts for a scene with accuracy = "auto": fronts.json of `maille tradeoff -o DIR`, in place of the program's own
+    #[arg(long, value_name = "FILE")]
+    fronts: Option<PathBuf>,
     /// Leave these services to be started by hand with `maille service` (haptic, deformation, rendering, console)
     #[arg(long, value_name = "SERVICE,…", value_delimiter = ',', value_parser = super::service::role)]
     by_hand: Vec<Role>,
@@ -48,6 +54,8 @@ pub fn run(args: &Args) -> Outcome {
         report: args.report.clone(),
         device: args.device.clone(),
         by_hand: args.by_hand.clone(),
+        fronts: args.fronts.clone(),
+        stages: args.stages,
     };
     match maille_supervisor::run(&options) {
         Ok(_) => Ok(()),

@@ -11,7 +11,7 @@ use std::{fs, io::Write as _, path::PathBuf};
 /// interleaved rounds, processor time of one thread). Marked are the Pareto front and the settings of draft, balanced and reference; where
 /// error does not fall as time grows, the reason is printed.
 ///
-/// -o DIR writes tradeoff.html (one page, no network), tradeoff.json, tradeoff.md and fronts.json (the fronts alone, for the governor).
+/// -o DIR writes tradeoff.html (one page, no network), tradeoff.json, tradeoff.md and fronts.json (the fronts alone, for the governor: `maille run --fronts`).
 #[derive(clap::Args)]
 pub struct Args {
     /// Only this knob, all knobs of an engine, or all whose name begins so; may be repeated. --list names them
@@ -59,7 +59,7 @@ pub fn run(args: &Args) -> Outcome {
                 ("tradeoff.html", report.to_html()),
                 ("tradeoff.json", format!("{:#}\n", report.to_json())),
                 ("tradeoff.md", report.to_markdown()),
-                ("fronts.json", format!("{:#}\n", report.fronts_json())),
+                ("fronts.json", report.fronts_json()),
             ],
         )?;
     }

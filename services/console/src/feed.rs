@@ -94,6 +94,18 @@ pub trait Feed {
     fn breath(&mut self) -> Option<&mut Signal>;
     /// Tells all how breathing is led.
     fn send_breath(&mut self, state: &BreathState);
+    /// Settings that the governor gave up: knob and value; `None` where the scene's accuracy is not its.
+    fn given_up(&mut self) -> Option<Vec<(&'static str, f64)>> {
+        None
+    }
+    /// Effects that may be switched live, and whether they are on.
+    fn switches(&mut self) -> Vec<(&'static str, bool)> {
+        Vec::new()
+    }
+    /// Switches an effect; false where it is none that may be.
+    fn switch(&mut self, _name: &str, _on: bool) -> bool {
+        false
+    }
     /// Asks for one more stroke of incision to be taken back.
     fn send_undo(&mut self) {}
     /// Says that the console is alive, how many frames it sent and how many requests it has refused.

@@ -7,13 +7,18 @@ use crate::{
     feed::{Facts, Feed, ServiceStatus, default_view},
     presets,
 };
+use bytemuck::Zeroable as _;
 use maille_breathing::Signal;
 use maille_contract::{
-    BreathState, Commit, FrameHeader, Role, ServiceCell, ServiceState, Stamp, ToolCommand, ToolState, UndoCommand, ViewState,
+    BreathState, Commit, FrameHeader, KnobState, Role, ServiceCell, ServiceState, Stamp, Switches, ToolCommand, ToolState, UndoCommand,
+    ViewState,
     control::{Counter, HEARTBEAT_LATE_NS},
 };
 use maille_raycast::{Preset, Transfer};
-use maille_scene::{BoxMm, CameraKind, Mode, Scene};
+use maille_scene::{
+    Accuracy, BoxMm, CameraKind, Mode, Scene,
+    registry::{LIVE_KNOBS, effects, place},
+};
 use maille_transport::{Domain, FrameSubscriber, Life, Node, Publisher, Subscriber, monotonic_ns};
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -46,6 +51,10 @@ struct Live {
     /// of a patient who breathes
     signal: Option<Signal>,
     first_view: ViewState,
+    /// effects that the scene calls for and that may be switched
+    live: Vec<&'static str>,
+    /// the scene leaves its accuracy to the governor
+    governed: bool,
     frames: FrameSubscriber,
     tool_states: Subscriber<ToolState>,
     commits: Subscriber<Commit>,
@@ -89,6 +98,8 @@ impl Live {
             first_view: told.unwrap_or_else(|| scene_view(scene, &box_mm)),
             facts,
             signal,
+            live: effects().filter(|e| e.live && scene.has_effect(e.name)).map(|e| e.name).collect(),
+            governed: scene.accuracy == Accuracy::Auto,
             frames: node.frame_subscriber()?,
             tool_states: node.subscriber()?,
             commits: node.subscriber()?,
@@ -197,6 +208,29 @@ impl Feed for Live {
         self.life.control().breath.store(state);
     }
 
+    fn switches(&mut self) -> Vec<(&'static str, bool)> {
+        let now = self.life.control().switches.load::<Switches>().map_or(Switches::zeroed(), |(switches, _)| switches);
+        self.live.iter().map(|&name| (name, place(name).is_none_or(|place| !now.is_off(place)))).collect()
+    }
+
+    fn switch(&mut self, name: &str, on: bool) -> bool {
+        let Some(place) = self.live.iter().find(|live| **live == name).and_then(|live| place(live)) else { return false };
+        let control = self.life.control();
+        let mut now = control.switches.load::<Switches>().map_or(Switches::zeroed(), |(switches, _)| switches);
+        now.switch(place, on);
+        now.stamp = self.life.stamp(now.stamp.sequence + 1);
+        control.switches.store(&now);
+        true
+    }
+
+    fn given_up(&mut self) -> Option<Vec<(&'static str, f64)>> {
+        if !self.governed {
+            return None;
+        }
+        let (knobs, _) = self.life.control().knobs.load::<KnobState>()?;
+        Some(LIVE_KNOBS.iter().enumerate().filter_map(|(place, (name, _))| Some((*name, knobs.get(place)?))).collect())
+    }
+
     fn send_undo(&mut self) {
         // counted on from what a console before this one asked for
         let last = self.life.control().undo.load::<UndoCommand>().map_or(0, |(command, _)| command.undos);
@@ -248,7 +282,6 @@ fn status(role: Role, cell: &ServiceCell, now: u64) -> ServiceStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use bytemuck::Zeroable;
 
     #[test]
     fn a_service_whose_heart_is_late_is_shown_as_stopped() {

@@ -6,6 +6,7 @@
 //! - `{"type":"tool","taken":true,"target_mm":[x,y,z]}` while the hand holds the tool, at least every 250 ms;
 //!   `{"type":"tool","taken":false}` lets it go;
 //! - `{"type":"breath","held":true,"level":0.4}`: the breath is held or goes on, and the slider leads it or (`null`) nobody does;
+//! - `{"type":"effect","name":"sections","on":false}`: an effect that may be switched live is switched;
 //! - `{"type":"undo"}`: the last stroke of incision is taken back;
 //! - `{"type":"ack","frame":n}` after frame n has been drawn: the next one is sent only then.
 //!
@@ -51,6 +52,8 @@ pub enum Request {
     Tool(ToolRequest),
     /// hold, lead or let go the breath
     Breath(BreathRequest),
+    /// switch an effect
+    Effect(EffectRequest),
     /// take the last stroke of incision back
     Undo(UndoRequest),
     /// a frame was drawn
@@ -134,6 +137,16 @@ pub struct BreathRequest {
     pub level: Option<f64>,
 }
 
+/// An effect is switched.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EffectRequest {
+    /// its name in the registry
+    pub name: String,
+    /// whether it shall be on
+    pub on: bool,
+}
+
 /// What does not change while the run lasts.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "type", rename = "hello")]
@@ -211,6 +224,10 @@ pub struct State<'a> {
     pub commit: Option<CommitSummary>,
     /// how the patient breathes, where one does
     pub breath: Option<crate::breath::Breath>,
+    /// effects that may be switched, and whether they are on
+    pub effects: Vec<(&'static str, bool)>,
+    /// what the governor gave up, knob and setting, where the scene leaves its accuracy to it
+    pub given_up: Option<Vec<(&'static str, f64)>>,
     /// requests refused since the start
     pub refused: u64,
     /// pages connected

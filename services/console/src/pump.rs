@@ -137,6 +137,11 @@ impl<F: Feed> Pump<F> {
                         self.hub.refuse();
                     }
                 }
+                Event::Request(_, Request::Effect(request)) => {
+                    if !self.feed.switch(&request.name, request.on) {
+                        self.hub.refuse();
+                    }
+                }
                 Event::Request(_, Request::Undo(_)) if self.feed.facts().incises => self.feed.send_undo(),
                 Event::Request(_, Request::Undo(_)) => self.hub.refuse(),
                 Event::Request(_, Request::Ack { .. }) => {}
@@ -239,6 +244,8 @@ impl<F: Feed> Pump<F> {
                 rates: self.rates,
                 commit: self.commit.as_ref().map(commit_seen),
                 breath,
+                effects: self.feed.switches(),
+                given_up: self.feed.given_up(),
                 refused: self.hub.refused.load(Relaxed),
                 pages: self.hub.pages.load(Relaxed),
             };

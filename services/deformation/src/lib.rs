@@ -16,14 +16,16 @@ mod recovery;
 mod restore;
 mod state;
 mod step;
+#[doc(hidden)]
+pub mod turns;
 
 use maille_chainmail::Capsule;
 use maille_contract::control::Counter;
 use maille_contract::messages::TOOL_IN_CONTACT;
 use maille_contract::{Commit, Role, ToolMove, UndoCommand, ViewState};
-use maille_scene::Scene;
+use maille_scene::{Accuracy, Machine, Process, Scene};
 use maille_store::{Reader, Writer};
-use maille_transport::{Domain, Life, Node, monotonic_ns};
+use maille_transport::{Domain, Life, Node, Stopwatch, Subscriber, Untimed, monotonic_ns, timed};
 use std::time::Duration;
 use thiserror::Error;
 
@@ -59,15 +61,36 @@ const FIRST_EPOCH: u64 = 1;
 /// When something it needs is missing at the start.
 pub fn run(domain: &str) -> Result<(), DeformationError> {
     let domain = Domain::named(domain)?;
-    let mut life = Life::begin(&domain, Role::Deformation)?;
+    let life = Life::begin(&domain, Role::Deformation)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| DeformationError::Scene(e.to_string()))?;
     let node = Node::open(&domain, "deformation")?;
-    let (moves, mut announcer) = (node.subscriber::<ToolMove>()?, announce::Announcer::new(node.publisher::<Commit>()?));
-    let (mut writer, reader) = (Writer::open(&domain)?, Reader::open(&domain, Role::Deformation)?);
+    let (moves, announcer) = (node.subscriber::<ToolMove>()?, announce::Announcer::new(node.publisher::<Commit>()?));
+    let (writer, reader) = (Writer::open(&domain)?, Reader::open(&domain, Role::Deformation)?);
     if let Some(threads) = scene.deformation.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }
-    let mut engine = step::Engine::new(&scene, reader.info());
+    let plan = maille_scene::plan(&scene, &reader.info().grid, Machine { cores: 1 });
+    let (stages, can_switch) = (plan.stage_names(Process::Deformation), plan.can_switch(Process::Deformation));
+    match timed(&domain, &life, Role::Deformation, stages)? {
+        Some(watch) => steps(&scene, life, &moves, announcer, writer, &reader, can_switch, watch),
+        None => steps(&scene, life, &moves, announcer, writer, &reader, can_switch, Untimed),
+    }
+    Ok(())
+}
+
+/// Answers moves until the run ends.
+#[allow(clippy::too_many_arguments)] // what the process has opened
+fn steps<W: Stopwatch>(
+    scene: &Scene,
+    mut life: Life,
+    moves: &Subscriber<ToolMove>,
+    mut announcer: announce::Announcer,
+    mut writer: Writer,
+    reader: &Reader,
+    can_switch: bool,
+    watch: W,
+) {
+    let mut engine = step::Engine::new(scene, reader.info(), watch);
     restore::restore(&mut engine, &writer);
     life.ready();
     if writer.epoch() > FIRST_EPOCH {
@@ -75,12 +98,16 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
     }
     let shortest_ns = (1e9 / scene.deformation.rate_hz) as u64;
     let (mut last_step, mut refused_view) = (0u64, 0u64);
+    // only a scene whose accuracy is the governor's looks for what that turned
+    let mut knobs_seen = (scene.accuracy == Accuracy::Auto).then_some(0u64);
+    // only a scene that calls for something that can be switched looks whether it was
+    let mut switches_seen = can_switch.then_some(0u64);
     while life.beat(monotonic_ns()) {
         if let Some((view, generation)) = life.control().view.load::<ViewState>() {
             match view.checked() {
                 Some(view) => {
                     let now = monotonic_ns();
-                    if let Some(done) = engine.set_threshold(view.threshold_hu, &reader, &mut writer) {
+                    if let Some(done) = engine.set_threshold(view.threshold_hu, reader, &mut writer) {
                         announcer.step(&mut life, &done, now, None);
                     }
                 }
@@ -91,6 +118,12 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
                 None => {}
             }
         }
+        if let Some(knobs) = knobs_seen.as_mut().and_then(|seen| life.control().turned_knobs(seen)) {
+            engine.turn(scene, &knobs, reader.info());
+        }
+        if let Some(switches) = switches_seen.as_mut().and_then(|seen| life.control().switched(seen)) {
+            engine.switch(&switches);
+        }
         let now = monotonic_ns();
         if let Some(epoch) = writer.publish_deferred() {
             announcer.published(&life, epoch);
@@ -98,7 +131,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
         // while too much waits to become visible (a stopped reader holds the slots) the tissue stands; the newest move stays queued
         let due = now.saturating_sub(last_step) >= shortest_ns && writer.has_room();
         if engine.cuts() && due {
-            if let Some(done) = engine.cut(life.control().held_tool(now).as_ref(), &reader, &mut writer) {
+            if let Some(done) = engine.cut(life.control().held_tool(now).as_ref(), reader, &mut writer) {
                 last_step = now;
                 announcer.step(&mut life, &done, now, None);
             }
@@ -122,7 +155,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
                     tool.iter().map(|t| Capsule { a: t.tip_reference_mm, b: t.tip_reference_mm, radius_mm: t.radius_mm }).collect();
                 // a push is answered at once, and what has moved so far is shown while pictures are still fluid
                 let stop = || moves.is_waiting() || monotonic_ns() > now + LONGEST_BATCH_NS;
-                if let Some(done) = engine.relax(now, 2 * RELAX_NS, &held, &stop, &reader, &mut writer) {
+                if let Some(done) = engine.relax(now, 2 * RELAX_NS, &held, &stop, reader, &mut writer) {
                     announcer.step(&mut life, &done, now, None);
                     continue;
                 }
@@ -139,9 +172,8 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             continue;
         }
         last_step = now;
-        if let Some(done) = engine.step(&message, now, &reader, &mut writer) {
+        if let Some(done) = engine.step(&message, now, reader, &mut writer) {
             announcer.step(&mut life, &done, now, Some(message.stamp.sequence));
         }
     }
-    Ok(())
 }

@@ -20,7 +20,7 @@ use maille_store::{
     CommitOutcome, Cuts, DISPLACEMENT_LEN, Plastic, Reader, Snapshot, StoreKeeper, StoreSizes, Writer,
     fault::{Died, Point, die_here, live_on},
 };
-use maille_transport::{ControlMap, Domain};
+use maille_transport::{ControlMap, Domain, Untimed};
 use maille_volume::{Brick, BrickSource, Grid, Rescale, Volume};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 
@@ -75,7 +75,7 @@ fn volume() -> Volume {
 
 /// What a process holds.
 struct Process {
-    engine: Engine,
+    engine: Engine<Untimed>,
     writer: Writer,
     reader: Reader,
 }
@@ -106,7 +106,7 @@ impl World {
         self.process = None;
         let (writer, reader) = (Writer::open(&self.domain).unwrap(), Reader::open(&self.domain, Role::Deformation).unwrap());
         writer.audit().unwrap();
-        let mut engine = Engine::new(&self.scene, reader.info());
+        let mut engine = Engine::new(&self.scene, reader.info(), Untimed);
         engine.mail.set_plasticity(vec![PlasticBand { from_hu: -500.0, fraction: 0.2 }, PlasticBand { from_hu: 60.0, fraction: 0.5 }]);
         restore(&mut engine, &writer);
         let mut process = Process { engine, writer, reader };
@@ -492,7 +492,7 @@ fn a_successor_that_forgets_something_is_found() {
     assert_eq!(difference(&whole.snapshot(), &broken.snapshot()), None);
     broken.start(None);
     // as if displacements had not been in the transaction
-    broken.process().engine = Engine::new(&scene, &volume().info);
+    broken.process().engine = Engine::new(&scene, &volume().info, Untimed);
     let message = push(&mut random, 7);
     step(&mut whole, message);
     step(&mut broken, message);

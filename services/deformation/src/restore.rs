@@ -3,9 +3,10 @@
 use crate::{state::State, step::Engine};
 use maille_chainmail::DisplacementBrick;
 use maille_store::{Cuts, Plastic, Writer};
+use maille_transport::Stopwatch;
 
 /// Puts every committed displacement back, its plastic part, the cut links, and the state.
-pub(crate) fn restore(engine: &mut Engine, writer: &Writer) {
+pub(crate) fn restore<W: Stopwatch>(engine: &mut Engine<W>, writer: &Writer) {
     for id in 0..writer.layout().count() as u32 {
         if let Some(numbers) = writer.displacement(id) {
             engine.moved.insert(id);

@@ -17,11 +17,15 @@ use maille_chainmail::{
     Admission, Capsule, ChainMail, ChangedRegion, LinkModel, Metric, Motion, Pin, PlasticBand, RelaxOptions, Slender, Tissue,
     elements_in_sphere, enclosing_elements, intersection_search, swept_blade,
 };
-use maille_contract::{Stamp, ToolMove, ToolState};
+use maille_contract::{KnobState, Stamp, Switches, ToolMove, ToolState};
 use maille_displacement::{along_axes, in_patient};
 use maille_mapper::{BrickSink, MapOptions, Mapper, Sampling, rest_position, tissue_rest_position};
-use maille_scene::{Pins, Push, Relaxation, Scene, ToolKind};
+use maille_scene::{
+    Pins, Push, Relaxation, Scene, ToolKind,
+    registry::{live_knob, place},
+};
 use maille_store::{CommitOutcome, Cuts, Plastic, Reader, Transaction, Writer};
+use maille_transport::Stopwatch;
 use maille_volume::{Brick, BrickId, Sampler, VolumeInfo};
 use std::collections::BTreeSet;
 
@@ -32,7 +36,9 @@ const SHORTEST_PUSH_MM: f64 = 0.01;
 const VOID_HU: f64 = -1000.0;
 
 /// ChainMail with what a scene says of it.
-pub(crate) struct Engine {
+pub(crate) struct Engine<W> {
+    /// times stages, in a run that asks for it
+    pub watch: W,
     pub mail: ChainMail,
     pub state: State,
     pins: Pins,
@@ -40,8 +46,10 @@ pub(crate) struct Engine {
     map: MapOptions,
     /// keeps its memory from step to step
     mapper: Mapper,
-    /// where the scene asks for it
+    /// where the scene asks for it and it is not switched off
     relax: Option<Relax>,
+    /// while it is switched off
+    relax_off: Option<Relax>,
     /// links follow the live threshold
     object_shape: bool,
     /// length of the blade's edge [mm], where a blade is held and the scene asks for cutting
@@ -93,8 +101,15 @@ impl BrickSink for Sink<'_, '_> {
     }
 }
 
-impl Engine {
-    pub fn new(scene: &Scene, info: &VolumeInfo) -> Self {
+/// What the mapper is told, by the knobs that it has.
+fn map_options(tolerance_mm: f64, sampling_order: f64, info: &VolumeInfo) -> MapOptions {
+    let tolerance = (tolerance_mm / info.grid.min_spacing()) as f32;
+    let sampling = if sampling_order >= 3.0 { Sampling::Cubic } else { Sampling::Linear };
+    MapOptions { tolerance, void_hu: VOID_HU, sampling, ..MapOptions::default() }
+}
+
+impl<W: Stopwatch> Engine<W> {
+    pub fn new(scene: &Scene, info: &VolumeInfo, watch: W) -> Self {
         let d = &scene.deformation;
         let object_shape = scene.has_effect("object-shape");
         let tissue = Tissue {
@@ -108,9 +123,7 @@ impl Engine {
                 Push::Clamp => Admission::ByComponent,
             },
         };
-        let tolerance = (d.inversion_tolerance_mm / info.grid.min_spacing()) as f32;
-        let sampling = if d.sampling_order >= 3 { Sampling::Cubic } else { Sampling::Linear };
-        let map = MapOptions { tolerance, void_hu: VOID_HU, sampling, ..MapOptions::default() };
+        let map = map_options(d.inversion_tolerance_mm, d.sampling_order.into(), info);
         let state = State {
             version: VERSION,
             threshold_hu: d.threshold_hu,
@@ -137,6 +150,7 @@ impl Engine {
         }
         let blade = scene.tool.as_ref().filter(|tool| tool.kind == ToolKind::Blade && scene.has_effect("cutting"));
         Self {
+            watch,
             mail,
             state,
             pins: d.pins,
@@ -144,12 +158,21 @@ impl Engine {
             map,
             mapper: Mapper::new(),
             relax,
+            relax_off: None,
             object_shape,
             blade_mm: blade.map(|tool| tool.blade_mm),
             edge: None,
             moved: BTreeSet::new(),
             incisions: Incisions::new(scene),
         }
+    }
+
+    /// Takes the settings that stand for the mapper: they hold from the next step on, and what was written stays as it is.
+    pub fn turn(&mut self, scene: &Scene, knobs: &KnobState, info: &VolumeInfo) {
+        let value = |name: &str, own: f64| live_knob(name).and_then(|place| knobs.get(place)).unwrap_or(own);
+        let d = &scene.deformation;
+        let tolerance_mm = value("deformation.inversion_tolerance_mm", d.inversion_tolerance_mm);
+        self.map = map_options(tolerance_mm, value("deformation.sampling_order", d.sampling_order.into()), info);
     }
 
     fn adopt(&mut self, threshold_hu: f64) {
@@ -210,7 +233,9 @@ impl Engine {
 
     /// Cuts what an edge sweeps through from one place (tip, tail) to another [mm].
     pub fn sweep(&mut self, before: [[f64; 3]; 2], after: [[f64; 3]; 2], reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        self.watch.start();
         let region = self.mail.cut_triangles(&reader.rest(), &swept_blade(before, after));
+        self.watch.split("cut");
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))
     }
 
@@ -249,6 +274,7 @@ impl Engine {
 
     /// Answers a tool move at `now_ns`, as the scene has it; `None` when there is nothing to do.
     pub fn step(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        self.watch.start();
         if self.incisions.is_some() { self.incise(message, now_ns, reader, writer) } else { self.press(message, now_ns, reader, writer) }
     }
 
@@ -272,6 +298,7 @@ impl Engine {
         let pins: Vec<Pin> = elements.into_iter().map(|voxel| Pin { voxel, motion }).collect();
         let rest = reader.rest();
         let pushed = self.mail.push(&rest, &pins);
+        self.watch.split("chainmail");
         if pushed.moved == 0 {
             return None;
         }
@@ -280,6 +307,14 @@ impl Engine {
         self.state.pushes += 1;
         let refused_mm = in_patient(grid, pushed.refused_mm.map(f64::from));
         Some(Done { moved_elements: pushed.moved, refused_mm, ..self.commit(&pushed.region, reader, writer) })
+    }
+
+    /// Switches relaxation off or on again, where the scene asks for it: tissue stays where it is, or creeps on from there.
+    pub fn switch(&mut self, switches: &Switches) {
+        let off = place("relaxation").is_some_and(|place| switches.is_off(place));
+        if off != (self.relax.is_none() && self.relax_off.is_some()) {
+            std::mem::swap(&mut self.relax, &mut self.relax_off);
+        }
     }
 
     /// Whether the scene asks for relaxation.
@@ -305,6 +340,7 @@ impl Engine {
     ) -> Option<Done> {
         let dt_s = now_ns.saturating_sub(self.state.last_step_ns).min(longest_ns) as f64 * 1e-9;
         self.state.last_step_ns = now_ns;
+        self.watch.start();
         let region = match self.relax.as_mut()? {
             Relax::Decay(time_s) => self.mail.relax((-dt_s / *time_s).exp() as f32, SNAP_MM),
             Relax::Elastic(options) => {
@@ -314,6 +350,7 @@ impl Engine {
                 relaxed.region
             }
         };
+        self.watch.split("relaxation");
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))
     }
 
@@ -326,11 +363,14 @@ impl Engine {
     fn commit_with(&mut self, region: &ChangedRegion, numbered: &BTreeSet<BrickId>, reader: &Reader, writer: &mut Writer) -> Done {
         let mut transaction = writer.begin();
         let mapped = self.mapper.remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
+        self.watch.split("mapper");
         let bricks: BTreeSet<BrickId> = region.ids().chain(numbered.iter().copied()).collect();
         self.commit_elements(&bricks, &mut transaction);
         self.state.write(transaction.state_mut());
         let bricks = mapped.bricks.len() as u64;
-        Done { outcome: transaction.commit(), moved_elements: 0, bricks, failures: mapped.failures, refused_mm: [0.0; 3] }
+        let outcome = transaction.commit();
+        self.watch.split("commit");
+        Done { outcome, moved_elements: 0, bricks, failures: mapped.failures, refused_mm: [0.0; 3] }
     }
 
     /// Where the surface was met and how far it must go [mm, patient], if it must.

@@ -18,12 +18,14 @@ mod publisher;
 mod setup;
 mod smooth;
 mod tick;
+#[doc(hidden)]
+pub mod turns;
 
 use maille_contract::{Role, control::Counter};
 use maille_realtime::{Period, enter_realtime, lock_memory, monotonic_ns, prefault_stack, steady};
-use maille_scene::Scene;
+use maille_scene::{Machine, Process, Scene};
 use maille_store::Reader;
-use maille_transport::{Domain, Life};
+use maille_transport::{Domain, Life, Stopwatch, Untimed, timed};
 use std::sync::Arc;
 use thiserror::Error;
 
@@ -56,15 +58,24 @@ const LEAVE_NS: u64 = 400_000_000;
 /// When something it needs is missing at the start.
 pub fn run(domain: &str) -> Result<(), HapticError> {
     let domain = Domain::named(domain)?;
-    let mut life = Life::begin(&domain, Role::Haptic)?;
+    let life = Life::begin(&domain, Role::Haptic)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| HapticError::Scene(e.to_string()))?;
     let reader = Reader::open(&domain, Role::Haptic)?;
+    let stages = maille_scene::plan(&scene, &reader.info().grid, Machine { cores: 1 }).stage_names(Process::Haptic);
+    match timed(&domain, &life, Role::Haptic, stages)? {
+        Some(watch) => serve(&domain, life, &scene, &reader, watch),
+        None => serve(&domain, life, &scene, &reader, Untimed),
+    }
+}
+
+/// Sets the loop up and runs it.
+fn serve<W: Stopwatch>(domain: &Domain, mut life: Life, scene: &Scene, reader: &Reader, watch: W) -> Result<(), HapticError> {
     let outbox = Arc::new(outbox::Outbox::new());
-    let publisher = publisher::start(&domain, &scene, Arc::clone(&outbox), life.incarnation())?;
+    let publisher = publisher::start(domain, scene, Arc::clone(&outbox), life.incarnation())?;
     // nothing is mapped, and nothing of it runs, in a scene that does not breathe
-    let mut regions = maille_breathing::Regions::open(&domain, &scene)?;
+    let mut regions = maille_breathing::Regions::open(domain, scene)?;
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
-    let mut tick = tick::Loop::new(&domain, &scene, &reader, patient, outbox, publisher.thread().clone())?;
+    let mut tick = tick::Loop::new(domain, scene, reader, patient, outbox, publisher.thread().clone(), watch)?;
 
     let notices = enter_realtime(scene.haptic.priority.clamp(1, 99) as i32, scene.haptic.cpu);
     for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {
@@ -77,14 +88,14 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
     // pages of the tissue come beside the loop: until then a first touch costs a tick a microsecond, waiting for all would cost the hand 0.1 s a GiB
     std::thread::scope(|scope| {
         scope.spawn(|| reader.prefault());
-        ticks(&scene, &mut life, &mut tick);
+        ticks(scene, &mut life, &mut tick);
     });
     publisher.stop();
     Ok(())
 }
 
 /// The loop itself, until the run ends and the force has faded.
-fn ticks(scene: &Scene, life: &mut Life, tick: &mut tick::Loop<'_>) {
+fn ticks<W: Stopwatch>(scene: &Scene, life: &mut Life, tick: &mut tick::Loop<'_, W>) {
     let mut period = Period::new(scene.haptic.rate_hz);
     let mut leaving_since = None;
     loop {

@@ -10,12 +10,14 @@ use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_
 use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Device, Scene};
 use maille_store::Reader;
-use maille_transport::{Domain, Life};
+use maille_transport::{Domain, Life, Stopwatch};
 use maille_volume::Sampler;
 use std::{sync::Arc, sync::atomic::Ordering::Relaxed, thread::Thread};
 
 /// State of the loop.
-pub(crate) struct Loop<'a> {
+pub(crate) struct Loop<'a, W> {
+    /// times stages, in a run that asks for it
+    watch: W,
     reader: &'a Reader,
     core: HapticCore,
     operator: Operator,
@@ -41,7 +43,7 @@ pub(crate) struct Loop<'a> {
     unmapped: bool,
 }
 
-impl<'a> Loop<'a> {
+impl<'a, W: Stopwatch> Loop<'a, W> {
     /// Sets the loop up; everything that allocates happens here.
     pub fn new(
         domain: &Domain,
@@ -50,6 +52,7 @@ impl<'a> Loop<'a> {
         patient: Option<Patient<'a>>,
         outbox: Arc<Outbox>,
         publisher: Thread,
+        watch: W,
     ) -> Result<Self, HapticError> {
         let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
         let real = device::kind(tool).map(|kind| device::options(scene).map(|options| (kind, options))).transpose()?;
@@ -82,6 +85,7 @@ impl<'a> Loop<'a> {
             real.as_ref().and(profile.as_ref()).map(|p| p.max_torque_n_mm),
         )?;
         Ok(Self {
+            watch,
             reader,
             smooth: SmoothStage::new(scene, &rest, config.radius_mm)?,
             needle,
@@ -119,15 +123,18 @@ impl<'a> Loop<'a> {
     pub fn run(&mut self, life: &Life, monotonic_ns: u64, release: bool) -> [f64; 3] {
         let control = life.control();
         let now_ns = control.time_ns(monotonic_ns);
+        self.watch.start();
         self.listen(control);
         let said = || control.device.load().map(|(said, _)| said);
         let (mut pose, pose_age_s) = self.operator.sample(now_ns, monotonic_ns, self.command.as_ref(), said);
+        self.watch.split("device");
         if self.needle.is_some() {
             return self.run_needle(life, monotonic_ns, now_ns, (pose, pose_age_s), release);
         }
         let (mut orientation, world, vouched) = (self.operator.orientation(), pose.direction, pose.valid);
         // from here to `leave` everything is of the patient at rest
         let mut moment = self.breather.as_mut().map(|breather| breather.enter(now_ns, &mut pose, &mut orientation));
+        self.watch.split("world to reference");
         if let Some(orientation) = orientation {
             self.core.set_orientation(orientation);
         }
@@ -153,12 +160,14 @@ impl<'a> Loop<'a> {
                 self.core.tick_in(&TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s, release }, moving)
             }
         };
+        self.watch.split("contact");
         let tip_reference_mm = out.tip_mm;
         if let Some(moment) = &moment {
             moment.leave(&mut out);
             self.residual_mm = moment.residual_mm;
             self.unmapped = vouched && moment.residual_mm.is_none();
         }
+        self.watch.split("force to world");
         self.give(life, monotonic_ns, &out);
         self.hand_over(control, now_ns, epoch, [world, pose.direction], tip_reference_mm, &out);
         self.last = Some(out);
@@ -190,6 +199,7 @@ impl<'a> Loop<'a> {
             None => stage.tick(&snapshot, &maille_needle::AtRest, &moment),
         };
         stage.publish(control);
+        self.watch.split("needle");
         let (tip_reference_mm, direction) = (stage.tip_reference_mm(), stage.direction());
         let epoch = snapshot.epoch();
         self.give(life, monotonic_ns, &out);
@@ -233,7 +243,7 @@ impl<'a> Loop<'a> {
 
     /// Tells what was felt; `directions` are the tool's in world and in reference space.
     fn hand_over(
-        &self,
+        &mut self,
         control: &ControlBlock,
         time_ns: u64,
         epoch: u64,
@@ -261,6 +271,7 @@ impl<'a> Loop<'a> {
         };
         control.tool.store(&state);
         self.outbox.state.store(&state);
+        self.watch.split("hand over");
         if let Some(m) = out.tool_move {
             let message = ToolMove {
                 stamp: Stamp { sequence: m.sequence, ..stamp },
@@ -275,6 +286,7 @@ impl<'a> Loop<'a> {
             // the tick's only system call, where the publisher sleeps: FUTEX_WAKE, which never waits
             self.publisher.unpark();
         }
+        self.watch.split("tool moves");
     }
 
     /// Counts what the last tick was like.

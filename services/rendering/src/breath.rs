@@ -25,6 +25,8 @@ pub(crate) struct Breather<'a> {
     report: WarpReport,
     /// what a picture's own lattice may add [mm]: half of the warp's tolerance
     view_mm: f32,
+    /// lattices that were tried, coarsest first: distance of nodes, and how far from its place anything was drawn by it [mm]
+    tried: Vec<(f32, f32)>,
 }
 
 impl<'a> Breather<'a> {
@@ -37,7 +39,8 @@ impl<'a> Breather<'a> {
         let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm };
         let collapsed = Collapsed::new(patient.model(), tolerance_mm as f32);
         let warp = Warp::new(info, options(PITCHES_MM[0]));
-        let mut breather = Self { patient, info: info.clone(), collapsed, warp, report: WarpReport::default(), view_mm: 0.5 * within_mm };
+        let (report, view_mm) = (WarpReport::default(), 0.5 * within_mm);
+        let mut breather = Self { patient, info: info.clone(), collapsed, warp, report, view_mm, tried: Vec::new() };
         // between nodes closer than the fields' own there is nothing to be found but their kinks
         let finest = breather.patient.model().grid().min_spacing() as f32;
         let tried = |&pitch: &f32| nodes(pitch) <= MOST_NODES && (pitch >= finest || pitch >= PITCHES_MM[0]);
@@ -46,11 +49,22 @@ impl<'a> Breather<'a> {
             // both ends of a breath; deepest first, so that the lattice has room for all that follows
             let usual = [Breath { level: 1.0, rate: 0.0, phase: 0.0 }, Breath::EXPIRED, Breath { level: 0.5, rate: -0.8, phase: 0.25 }];
             let worst = usual.map(|breath| drawn_off_mm(&breather.bend(breath), breather.view_mm)).into_iter().fold(0.0, f32::max);
+            breather.tried.push((pitch, worst - breather.view_mm));
             if f64::from(worst) <= tolerance_mm {
                 break;
             }
         }
         breather
+    }
+
+    /// Another tolerance [mm], no finer than the one that it was made for: the coarsest lattice of those tried that keeps within it.
+    pub fn set_tolerance(&mut self, tolerance_mm: f64) {
+        let within_mm = 0.66 * tolerance_mm as f32;
+        self.view_mm = 0.5 * within_mm;
+        let fits = |(_, off_mm): &&(f32, f32)| f64::from(off_mm + self.view_mm) <= tolerance_mm;
+        let Some(&(pitch_mm, _)) = self.tried.iter().find(fits).or(self.tried.last()) else { return };
+        self.warp = Warp::new(&self.info, WarpOptions { tolerance_mm: within_mm, pitch_mm });
+        self.collapsed = Collapsed::new(self.patient.model(), tolerance_mm as f32);
     }
 
     /// Takes the page's last word; false when it made no sense.
@@ -101,7 +115,7 @@ mod tests {
     use maille_motion::{MotionModel, Precision, model::sampled};
     use maille_scene::{BoxMm, Scene};
     use maille_store::{Reader, StoreKeeper, StoreSizes};
-    use maille_transport::{ControlMap, Domain};
+    use maille_transport::{ControlMap, Domain, Untimed};
     use maille_volume::{Grid, Rescale, Volume};
 
     const SCENE: &str = "[volume]\nphantom = \"torso\"\n[breathing]\nsignal = \"console\"\n[effects]\nbreathing = true\n\
@@ -114,7 +128,7 @@ mod tests {
         let lifted = |p: [f64; 3]| Some([p[0], p[1], p[2] + eye_mm]);
         (scene.rendering.eye, scene.rendering.target) = (lifted(view.eye), lifted(view.target));
         let mut composer = Composer::new(&scene);
-        composer.draw(&reader.snapshot(), warp, &View::new(&scene, &box_mm).unwrap(), None, false, None).unwrap();
+        composer.draw(&reader.snapshot(), warp, &View::new(&scene, &box_mm).unwrap(), None, false, None, &mut Untimed).unwrap();
         let mut pixels = vec![0; composer.bytes()];
         composer.write(&mut pixels, FrameHeader::default());
         pixels

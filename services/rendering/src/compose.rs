@@ -1,12 +1,12 @@
 //! A frame: the views drawn, then laid side by side in one sample.
 
 use crate::{backend::Backend, overlay, view::View};
-use maille_contract::{FrameHeader, ToolState, messages::ViewRect};
+use maille_contract::{FrameHeader, Switches, ToolState, messages::ViewRect};
 use maille_raycast::{
     Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, ultrasound,
 };
-use maille_scene::Scene;
-use maille_transport::monotonic_ns;
+use maille_scene::{Scene, registry};
+use maille_transport::{Stopwatch, monotonic_ns};
 use maille_volume::BrickSource;
 
 /// Planes of views 1 to 3, in the order of [`maille_contract::messages::VIEWS`].
@@ -59,6 +59,16 @@ impl Composer {
         }
     }
 
+    /// Switches effects off, whose pictures' memory is given back, or on again, as far as the scene calls for them.
+    pub fn switch(&mut self, scene: &Scene, switches: &Switches) {
+        let [_, sections @ .., fan] = &mut self.pictures;
+        for (name, pictures) in [("sections", &mut sections[..]), ("ultrasound", std::slice::from_mut(fan))] {
+            let on = scene.has_effect(name) && !registry::place(name).is_some_and(|place| switches.is_off(place));
+            let [w, h] = if on { scene.rendering.section_size } else { [0, 0] };
+            pictures.iter_mut().filter(|p| [p.width, p.height] != [w, h]).for_each(|p| *p = Picture::new(w, h));
+        }
+    }
+
     /// Bytes of a frame.
     pub fn bytes(&self) -> usize {
         self.pictures.iter().map(|p| p.rgb.len()).sum()
@@ -66,6 +76,7 @@ impl Composer {
 
     /// Draws all views from one source, through a warp where the patient breathes. The tool is where views look; it is drawn while somebody
     /// holds it, in the world, where the hand has it.
+    #[allow(clippy::too_many_arguments)] // what is to be seen, and by whose watch
     pub fn draw(
         &mut self,
         source: &impl BrickSource,
@@ -74,6 +85,7 @@ impl Composer {
         tool: Option<&ToolState>,
         held: bool,
         needle: Option<&[Capsule]>,
+        watch: &mut impl Stopwatch,
     ) -> Result<(), RenderError> {
         let (camera, at_tip) = view.camera(tool);
         let mut settings = view.settings(at_tip);
@@ -110,6 +122,7 @@ impl Composer {
             enlarge(&self.coarse, whole);
         }
         self.view_ns = monotonic_ns() - start;
+        watch.split("ray casting");
         let [level, window] = view.window_hu();
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
@@ -117,6 +130,7 @@ impl Composer {
             let overlay = Overlay { warp, displacement_mm: self.overlay_mm, geometry: Some(&bodies), ..Overlay::default() };
             self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
+        watch.split("sections");
         if fan.width > 0 {
             let drawn = tool.is_some_and(|tool| ultrasound(source, &Ultrasound::new(overlay::probe(tool)), warp, fan).is_ok());
             if !drawn {
@@ -124,6 +138,7 @@ impl Composer {
                 fan.rgb.fill(0);
             }
         }
+        watch.split("ultrasound");
         Ok(())
     }
 
@@ -176,6 +191,24 @@ mod tests {
         let mut same = Picture::new(2, 2);
         enlarge(&small, &mut same);
         assert_eq!(same, small);
+    }
+
+    #[test]
+    fn what_is_switched_off_holds_no_memory_and_comes_back_as_it_was() {
+        let mut scene = Scene::builtin_default();
+        assert!(scene.has_effect("sections") && !scene.has_effect("ultrasound"));
+        scene.rendering.size = [64, 48];
+        let mut composer = Composer::new(&scene);
+        let whole = composer.bytes();
+        let mut switches: Switches = bytemuck::Zeroable::zeroed();
+        let place = |name| registry::place(name).unwrap();
+        switches.switch(place("sections"), false);
+        composer.switch(&scene, &switches);
+        assert_eq!((composer.bytes(), composer.pictures[1].rgb.capacity()), (64 * 48 * 3, 0));
+        switches.switch(place("sections"), true);
+        switches.switch(place("ultrasound"), true);
+        composer.switch(&scene, &switches);
+        assert_eq!(composer.bytes(), whole, "and nothing that the scene does not call for");
     }
 
     #[test]

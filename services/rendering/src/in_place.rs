@@ -10,7 +10,7 @@ use maille_contract::Role;
 use maille_raycast::Quality;
 use maille_scene::{BoxMm, Scene};
 use maille_store::{Reader, StoreKeeper, StoreSizes, Writer};
-use maille_transport::{ControlMap, Domain};
+use maille_transport::{ControlMap, Domain, Untimed};
 use maille_volume::{Brick, BrickId, BrickLayout, BrickSource, Grid, Rescale, Volume, VolumeInfo};
 use std::{
     ops::Range,
@@ -125,7 +125,7 @@ impl World {
     }
 
     pub fn draw(&self, composer: &mut Composer, source: &impl BrickSource) -> Vec<u8> {
-        composer.draw(source, None, &self.view(), None, false, None).unwrap();
+        composer.draw(source, None, &self.view(), None, false, None, &mut Untimed).unwrap();
         let mut pixels = vec![0; composer.bytes()];
         composer.write(&mut pixels, maille_contract::FrameHeader::default());
         pixels

@@ -17,15 +17,20 @@ mod gpu_tests;
 mod in_place;
 mod needle;
 mod overlay;
+#[doc(hidden)]
+pub mod turns;
 mod view;
 
 use maille_contract::needle::NeedleState;
 use maille_contract::{FrameHeader, Role, ServiceCell, ToolState, control::Counter};
-use maille_raycast::{FrameBudget, Quality};
-use maille_scene::{BoxMm, Machine, Scene};
+use maille_raycast::FrameBudget;
+use maille_scene::{Accuracy, BoxMm, Machine, Plan, Scene, registry::live_knob};
 use maille_store::Reader;
-use maille_transport::{Domain, FramePublisher, Life, Node, monotonic_ns};
-use std::{sync::Arc, time::Duration};
+use maille_transport::{Domain, FramePublisher, Life, Node, Stopwatch, Untimed, monotonic_ns, timed};
+use std::{
+    sync::{Arc, atomic::Ordering::Relaxed},
+    time::Duration,
+};
 use thiserror::Error;
 
 /// Why the rendering process could not start.
@@ -57,23 +62,38 @@ const NAP: Duration = Duration::from_millis(10);
 /// When something it needs is missing at the start.
 pub fn run(domain: &str) -> Result<(), RenderingError> {
     let domain = Domain::named(domain)?;
-    let mut life = Life::begin(&domain, Role::Rendering)?;
+    let life = Life::begin(&domain, Role::Rendering)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| RenderingError::Scene(e.to_string()))?;
     let reader = Arc::new(Reader::open(&domain, Role::Rendering)?);
-    // nothing is mapped, and nothing of it runs, in a scene that does not breathe
-    let mut regions = maille_breathing::Regions::open(&domain, &scene)?;
-    let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
-    let node = Node::open(&domain, "rendering")?;
-    let mut composer = compose::Composer::new(&scene);
-    let frames = node.frame_publisher(composer.bytes())?;
     let machine = Machine { cores: std::thread::available_parallelism().map_or(1, usize::from) };
     let plan = maille_scene::plan(&scene, &reader.info().grid, machine);
+    match timed(&domain, &life, Role::Rendering, plan.stage_names(maille_scene::Process::Rendering))? {
+        Some(watch) => frames(&domain, life, &scene, &reader, &plan, watch),
+        None => frames(&domain, life, &scene, &reader, &plan, Untimed),
+    }
+}
+
+/// Draws until the run ends.
+fn frames<W: Stopwatch + Send>(
+    domain: &Domain,
+    mut life: Life,
+    scene: &Scene,
+    reader: &Arc<Reader>,
+    plan: &Plan,
+    mut watch: W,
+) -> Result<(), RenderingError> {
+    // nothing is mapped, and nothing of it runs, in a scene that does not breathe
+    let mut regions = maille_breathing::Regions::open(domain, scene)?;
+    let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
+    let node = Node::open(domain, "rendering")?;
+    let mut composer = compose::Composer::new(scene);
+    let frames = node.frame_publisher(composer.bytes())?;
     let threads = plan.process(maille_scene::Process::Rendering).map_or(1, |p| p.threads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|n| format!("rays-{n}")).build()?;
-    let mut view = view::View::new(&scene, &BoxMm::of(&reader.info().grid))?;
+    let mut view = view::View::new(scene, &BoxMm::of(&reader.info().grid))?;
     let tolerance_mm = scene.breathing.picture_tolerance_mm;
     let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm)));
-    composer.backend = backend::Backend::of(&scene, &reader);
+    composer.backend = backend::Backend::of(scene, reader);
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
@@ -81,6 +101,15 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
     let (mut shown, mut header) = (None, FrameHeader::default());
     let has_needle = scene.has_effect("needle");
     let mut bodies = Vec::new();
+    // only a scene whose accuracy is the governor's looks for what that turned
+    let mut knobs_seen = (scene.accuracy == Accuracy::Auto).then_some(0u64);
+    // a run whose stages are timed draws every frame, also of what stands: it wants to know what one takes
+    let every = life.control().timed.load(Relaxed) != 0;
+    // only a scene that calls for something that can be switched looks whether it was
+    let mut switches_seen = plan.can_switch(maille_scene::Process::Rendering).then_some(0u64);
+    // and there it is the governor that says how finely is drawn, by measured fronts, for every frame
+    let adapt = scene.rendering.adapt && knobs_seen.is_none();
+    budget.hold(view.quality());
     loop {
         let now = monotonic_ns();
         if !life.beat(now) {
@@ -94,6 +123,17 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         if !view.listen(life.control()) {
             life.cell().count(Counter::Refused, 1);
         }
+        if let Some(knobs) = knobs_seen.as_mut().and_then(|seen| life.control().turned_knobs(seen)) {
+            view.turn(scene, &knobs);
+            let tolerance_mm = live_knob("breathing.picture_tolerance_mm").and_then(|place| knobs.get(place)).unwrap_or(tolerance_mm);
+            if let Some(breather) = &mut breather {
+                breather.set_tolerance(tolerance_mm);
+            }
+        }
+        if let Some(switches) = switches_seen.as_mut().and_then(|seen| life.control().switched(seen)) {
+            composer.switch(scene, &switches);
+            shown = None;
+        }
         let tool = life.control().tool.load::<ToolState>().map(|(tool, _)| tool);
         let held = life.control().held_tool(now).is_some();
         if breather.as_mut().is_some_and(|breather| !breather.listen(life.control())) {
@@ -104,10 +144,11 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         let moment = breather.as_ref().map_or(0, |_| time_ns);
         let needle = if has_needle { life.control().needle.load::<NeedleState>().map(|(needle, _)| needle) } else { None };
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
-        let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
-        let moving = shown != Some(seen);
+        let asked = (view.generation(), view.turns());
+        let seen = (reader.epoch(), asked, tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
+        let moving = every || shown != Some(seen);
         shown = Some(seen);
-        let quality = if scene.rendering.adapt { budget.next(moving) } else { moving.then_some(Quality::FULL) };
+        let quality = if adapt { budget.next(moving) } else { moving.then_some(view.quality()) };
         let Some(quality) = quality else {
             // what stands goes out again, for who has just come to look
             if sent > 0 && now - last_sent_ns >= STILL_NS {
@@ -125,8 +166,10 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
             needle::bodies(needle, to_world, &mut bodies);
         }
         let drawn = pool.install(|| {
+            watch.start();
             let warp = breather.as_mut().map(|breather| breather.go(time_ns));
-            composer.draw(&snapshot, warp, &view, tool.as_ref(), held, needle.map(|_| bodies.as_slice()))
+            watch.split("warp");
+            composer.draw(&snapshot, warp, &view, tool.as_ref(), held, needle.map(|_| bodies.as_slice()), &mut watch)
         });
         let render_ns = monotonic_ns() - now;
         let epoch = snapshot.epoch();
@@ -153,7 +196,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         if !life.record(now, monotonic_ns() - now, None) {
             continue;
         }
-        life.cell().count(Counter::Coarse, u64::from(quality != Quality::FULL));
+        let coarse = quality.scale < scene.rendering.scale || quality.step > 1.0;
+        life.cell().count(Counter::Coarse, u64::from(coarse));
         life.cell().count(Counter::OnGpu, u64::from(on_gpu));
         if let Some((off_mm, unsettled)) = breather.as_ref().map(breath::Breather::report) {
             life.control().warp.record((off_mm * 1e6) as u64);

@@ -1,9 +1,9 @@
 //! From the scene and the page's last word to cameras and settings.
 
 use crate::RenderingError;
-use maille_contract::{ControlBlock, ToolState, ViewState};
-use maille_raycast::{Camera, Light, Preset, Settings, Shading, Step, Transfer};
-use maille_scene::{BoxMm, CameraKind, Mode, Scene};
+use maille_contract::{ControlBlock, KnobState, ToolState, ViewState};
+use maille_raycast::{Camera, Light, Preset, Quality, Settings, Shading, Step, Transfer};
+use maille_scene::{BoxMm, CameraKind, Mode, Scene, registry::live_knob};
 
 /// What is to be seen.
 pub(crate) struct View {
@@ -17,6 +17,8 @@ pub(crate) struct View {
     window_hu: [f64; 2],
     step: Step,
     opacity_end: f64,
+    scale: f64,
+    turns: u64,
     shading: bool,
     page: Option<ViewState>,
     generation: u64,
@@ -37,6 +39,8 @@ impl View {
             window_hu: r.section_window_hu,
             step: Step::Voxels(r.step),
             opacity_end: r.opacity_end,
+            scale: r.scale,
+            turns: 0,
             shading: r.shading,
             page: None,
             generation: 0,
@@ -54,6 +58,26 @@ impl View {
         let sound = checked.is_some();
         self.page = checked.or(self.page);
         sound
+    }
+
+    /// Takes the settings that stand; what was not turned is as the scene has it.
+    pub fn turn(&mut self, scene: &Scene, knobs: &KnobState) {
+        let value = |name: &str, own: f64| live_knob(name).and_then(|place| knobs.get(place)).unwrap_or(own);
+        let r = &scene.rendering;
+        self.step = Step::Voxels(value("rendering.step", r.step));
+        self.opacity_end = value("rendering.opacity_end", r.opacity_end);
+        self.scale = value("rendering.scale", r.scale);
+        self.turns = knobs.turns;
+    }
+
+    /// How finely the 3D view is drawn, as far as knobs say so; the step is in the settings.
+    pub fn quality(&self) -> Quality {
+        Quality { scale: self.scale, step: 1.0 }
+    }
+
+    /// Changes whenever a knob was turned.
+    pub fn turns(&self) -> u64 {
+        self.turns
     }
 
     /// Changes whenever the page said something new.

@@ -6,6 +6,7 @@
 //!     ─ patient    the volume is read or made, with progress
 //!     ─ simulation memory, services and processes come and go together
 //!     ─ watch      one poll over deaths, words, signals and time; restart decides what follows a death
+//!     ─ governor   in a scene with `accuracy = "auto"`: loads are seen, knobs are turned
 //!     ─ report     what the run did
 //! ```
 //!
@@ -21,6 +22,8 @@
 pub mod doctor;
 pub mod enter;
 mod error;
+pub mod fronts;
+pub mod governor;
 pub mod memory;
 pub mod needle;
 mod output;
@@ -31,12 +34,15 @@ pub mod restart;
 mod signals;
 mod simulation;
 pub mod stale;
+#[doc(hidden)]
+pub mod still;
 mod watch;
 
 pub use enter::enter;
 pub use error::SupervisorError;
 pub use report::RunReport;
 
+use fronts::Fronts;
 use maille_contract::Role;
 use maille_scene::{Device, Scene};
 use signals::Signals;
@@ -44,6 +50,7 @@ use simulation::Simulation;
 use std::{
     fs,
     path::{Path, PathBuf},
+    sync::atomic::Ordering::Relaxed,
     time::Duration,
 };
 
@@ -77,6 +84,10 @@ pub struct RunOptions {
     pub device: Option<Device>,
     /// roles that a person will start with `maille service`
     pub by_hand: Vec<Role>,
+    /// time each stage of the services' loops, for the report
+    pub stages: bool,
+    /// measured fronts for `accuracy = "auto"`, in place of those that come with the program
+    pub fronts: Option<PathBuf>,
 }
 
 /// Runs a scene to its end: duration, SIGINT, SIGTERM, SIGHUP, or a service that cannot live. Main thread only: the kernel ends
@@ -97,6 +108,7 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
         scene.use_motion(motion.clone())?;
     }
     scene.console.enabled &= !options.headless;
+    let fronts = Fronts::open(options.fronts.as_deref())?;
     for removed in stale::clean_dead_runs()? {
         say!("{removed}");
     }
@@ -118,10 +130,12 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     say!("domain       {}", simulation.domain());
     drop((patient, breath));
 
+    simulation.control.timed.store(u64::from(options.stages), Relaxed);
     simulation.begin();
     for role in &options.by_hand {
         say!("{:<12} waits for `maille service {} --domain {}`", role.word(), role.word(), simulation.domain());
     }
+    simulation.govern(&fronts);
     let outcome = simulation.watch(&mut signals, options.duration);
     let report = simulation.end(outcome.as_ref().unwrap_or(&"failure"));
     drop(simulation);

@@ -109,7 +109,7 @@ fn beside<T: Send + 'static>(
     }
 }
 
-fn make(source: &VolumeSource) -> Result<Patient, SupervisorError> {
+pub(crate) fn make(source: &VolumeSource) -> Result<Patient, SupervisorError> {
     match source {
         VolumeSource::File(path) => Ok(io::read_volume(path)?),
         &VolumeSource::Phantom { kind, size, seed } => {

@@ -13,6 +13,7 @@
 //! | `services.S.restarts` | starts after the first |
 //! | `services.S.private_mib`, `private_peak_mib` | `Private_Dirty` shortly before the end, and the most seen |
 //! | `services.S.stalls` | times without a heartbeat for 0.5 s |
+//! | `services.S.stages` | with `--stages`: `name`, `count` and mean time `us` of each stage of its loop, in order, warm-up included |
 //! | `services.S.killed` | it did not end within 1 s when asked |
 //! | `services.haptic.rate_hz`, `overruns` | ticks a second after warm-up; releases missed and not caught up |
 //! | `services.haptic.tick_us`, `lateness_us` | compute of a tick; how late it began: `p50`, `p99`, `p999`, `max` |
@@ -31,12 +32,13 @@
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
 //! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (last) and `closest_to_target_mm` in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` of a tick's rod, `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
+//! | `governor` | with `accuracy = "auto"`: `fronts` where they come from, `ladder` what could be given up, in order, `turns` (time, knob, value, loop, whether accuracy was given up, load), `given_up` what stood so at the end |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
-use crate::{memory::MIB, needle::NeedleReport, watch::Post};
+use crate::{governor::GovernorReport, memory::MIB, needle::NeedleReport, watch::Post};
 use maille_contract::{
     ControlBlock, Role,
-    control::Counter,
+    control::{Counter, StageCell},
     histogram::{Percentiles, SharedHistogram, lower},
 };
 use serde::Serialize;
@@ -174,6 +176,15 @@ pub enum Own {
     Console {},
 }
 
+/// Time of a stage.
+#[derive(Clone, Debug, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct StageReport {
+    pub name: &'static str,
+    pub count: u64,
+    pub us: f64,
+}
+
 /// Of one service.
 #[derive(Clone, Debug, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -184,6 +195,8 @@ pub struct ServiceReport {
     pub private_peak_mib: f64,
     pub stalls: u64,
     pub killed: bool,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub stages: Vec<StageReport>,
     #[serde(flatten)]
     pub own: Own,
 }
@@ -212,12 +225,19 @@ pub struct RunReport {
     pub store: StoreReport,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub needle: Option<NeedleReport>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub governor: Option<GovernorReport>,
 }
 
 impl ServiceReport {
     /// The numbers of one post.
-    pub(crate) fn of(control: &ControlBlock, post: &Post, killed: bool) -> Self {
+    pub(crate) fn of(control: &ControlBlock, post: &Post, killed: bool, stages: &[&'static str]) -> Self {
         let cell = control.service(post.role);
+        let timed = |(name, cell): (&&'static str, &StageCell)| {
+            let count = cell.count.load(Relaxed);
+            (count > 0).then(|| StageReport { name, count, us: cell.total_ns.load(Relaxed) as f64 * 1e-3 / count as f64 })
+        };
+        let stages = stages.iter().zip(&cell.stages).filter_map(timed).collect();
         Self {
             pid: cell.pid.load(Relaxed),
             restarts: cell.restarts.load(Relaxed),
@@ -225,6 +245,7 @@ impl ServiceReport {
             private_peak_mib: post.private_peak_mib,
             stalls: post.stalls,
             killed,
+            stages,
             own: own(post.role, control),
         }
     }
@@ -375,6 +396,15 @@ impl fmt::Display for RunReport {
                 )?;
             }
         }
+        if let Some(g) = &self.governor {
+            let stand: Vec<String> = g.given_up.iter().map(|(knob, value)| format!("{knob} = {value}")).collect();
+            let stand = if stand.is_empty() { "nothing given up at the end".into() } else { format!("at the end {}", stand.join(", ")) };
+            writeln!(f, "\ngovernor: {} turns, {stand}", g.turns.len())?;
+            for t in &g.turns {
+                let what = if t.coarser { "takes" } else { "would take" };
+                writeln!(f, "  {:>7.1} s  {} = {}: {} {what} {:.0} % of its time", t.time_s, t.knob, t.value, t.of, 100.0 * t.load)?;
+            }
+        }
         let low = self.store.spare_slots_low.map_or("all".into(), |low| low.to_string());
         write!(
             f,
@@ -395,7 +425,8 @@ mod tests {
     }
 
     fn report(control: &ControlBlock) -> serde_json::Value {
-        let services = Role::ALL.map(|role| (role.word().to_owned(), ServiceReport::of(control, &Post::new(role, false), false)));
+        let services =
+            Role::ALL.map(|role| (role.word().to_owned(), ServiceReport::of(control, &Post::new(role, false), false, &["device"])));
         let store = StoreReport::of(1 << 20, &[("rest".to_owned(), 3 << 20), ("control".to_owned(), 1 << 20)].into(), 10, u64::MAX);
         let report = RunReport { services: services.into(), store, ..RunReport::default() };
         assert!(report.to_string().contains("haptic tick µs"));
@@ -433,6 +464,8 @@ mod tests {
         haptic.duration.record(25_000);
         haptic.lateness.record(2_000_000_000);
         haptic.count(Counter::InContact, 4_500);
+        haptic.stages[0].record(3_000);
+        haptic.stages[0].record(5_000);
         control.service(Role::Rendering).duration.record(30_000_000);
         let json = report(&control);
         let number = |path: &str| json.pointer(path).unwrap().as_f64().unwrap();
@@ -440,6 +473,8 @@ mod tests {
         assert_eq!(number("/services/haptic/tick_us/max"), 25.0);
         assert_eq!(number("/services/rendering/frame_ms/max"), 30.0);
         assert_eq!(number("/services/haptic/contact_share"), 0.5);
+        assert_eq!(json["services"]["haptic"]["stages"], serde_json::json!([{ "name": "device", "count": 2, "us": 4.0 }]));
+        assert!(json["services"]["rendering"].get("stages").is_none(), "what was not timed is not told");
         assert_eq!(json["services"]["haptic"]["tick_histogram"][5], serde_json::json!([50, 1]), "25 µs are above 20 and not above 50");
         assert_eq!(json["services"]["haptic"]["lateness_histogram"][16], serde_json::json!([null, 1]));
     }

@@ -5,7 +5,10 @@
 //! as [`Simulation::end`], so an error, a panic or an early return leaves as little behind as an orderly end.
 
 use crate::{
-    SupervisorError, memory,
+    SupervisorError,
+    fronts::Fronts,
+    governor::Pilot,
+    memory,
     needle::{self, NeedleReport},
     patient::{Patient, Progress},
     report::{RunReport, ServiceReport, StoreReport},
@@ -18,7 +21,7 @@ use maille_contract::{
     messages::TRANSFER_POINTS,
 };
 use maille_scene::{
-    BoxMm, CameraKind, Mode, Process, Scene, Signal,
+    Accuracy, BoxMm, CameraKind, Mode, Process, Scene, Signal,
     plan::{Machine, Plan, plan},
 };
 use maille_store::{StoreKeeper, StorePlan, StoreSizes};
@@ -47,6 +50,10 @@ pub struct Simulation {
     info: VolumeInfo,
     scene: Scene,
     spare_slots: usize,
+    /// names of the stages of each role, in order
+    stages: [Vec<&'static str>; Role::ALL.len()],
+    /// with `accuracy = "auto"`
+    pilot: Option<Pilot>,
     started_ns: u64,
     killed: Vec<Role>,
     ended: bool,
@@ -119,6 +126,9 @@ impl Simulation {
             info: volume.info.clone(),
             scene,
             spare_slots: sizes.spare_slots,
+            stages: Role::ALL
+                .map(|r| plan.processes.iter().find(|p| role(p.process) == Some(r)).map_or(Vec::new(), |p| plan.stage_names(p.process))),
+            pilot: None,
             started_ns: monotonic_ns(),
             killed: Vec::new(),
             ended: false,
@@ -148,7 +158,12 @@ impl Simulation {
             self.node.clean_dead_nodes();
         };
         let watch = Watch { domain: self.domain.0.name(), control: &self.control, clean_dead_nodes: &clean };
-        watch.run(&mut self.posts, signals, duration)
+        watch.run(&mut self.posts, self.pilot.as_mut(), signals, duration)
+    }
+
+    /// Where the scene leaves its accuracy to the governor: gives it one, with these fronts.
+    pub fn govern(&mut self, fronts: &Fronts) {
+        self.pilot = (self.scene.accuracy == Accuracy::Auto).then(|| Pilot::new(&self.scene, fronts));
     }
 
     /// Ends all processes, and says what the run did. Memory and files go when the value is dropped.
@@ -162,7 +177,12 @@ impl Simulation {
             .iter()
             .filter(|post| !post.by_hand || self.control.service(post.role).restarts.load(Relaxed) > 0 || post.private_mib.is_some());
         let services = filled
-            .map(|post| (post.role.word().to_owned(), ServiceReport::of(&self.control, post, self.killed.contains(&post.role))))
+            .map(|post| {
+                (
+                    post.role.word().to_owned(),
+                    ServiceReport::of(&self.control, post, self.killed.contains(&post.role), &self.stages[post.role as usize]),
+                )
+            })
             .collect();
         RunReport {
             domain: self.domain().to_owned(),
@@ -170,6 +190,7 @@ impl Simulation {
             ended_by: ended_by.to_owned(),
             services,
             needle: NeedleReport::of(&self.scene, &self.control),
+            governor: self.pilot.as_ref().map(Pilot::report),
             store: StoreReport::of(
                 self.info.grid.voxel_count(),
                 &segments,

@@ -9,7 +9,9 @@
 //! supervisor is stuck or gone end themselves; pins are released after a confirmed death, never on a guess.
 
 use crate::{
-    SupervisorError, memory,
+    SupervisorError,
+    governor::Pilot,
+    memory,
     process::Process,
     restart::{Decision, EARLY_DEATHS, Restarts},
     say,
@@ -99,7 +101,13 @@ pub struct Watch<'a> {
 
 impl Watch<'_> {
     /// Keeps the posts filled until the duration is over or a signal comes; says which. Main thread only.
-    pub fn run(&self, posts: &mut [Post], signals: &mut Signals, duration: Option<Duration>) -> Result<&'static str, SupervisorError> {
+    pub fn run(
+        &self,
+        posts: &mut [Post],
+        mut pilot: Option<&mut Pilot>,
+        signals: &mut Signals,
+        duration: Option<Duration>,
+    ) -> Result<&'static str, SupervisorError> {
         let start_ns = monotonic_ns();
         let (mut running_since, mut port, mut memory_due) = (None, 0, start_ns + MEMORY_PERIOD_NS / 2);
         loop {
@@ -122,6 +130,9 @@ impl Watch<'_> {
             if said != port {
                 port = said;
                 say!("page         http://127.0.0.1:{port}");
+            }
+            if let Some(turned) = pilot.as_mut().and_then(|pilot| pilot.look(self.control, now)) {
+                say!("governor     {turned}");
             }
             if now >= memory_due {
                 posts.iter_mut().for_each(Post::sample_memory);

@@ -435,7 +435,7 @@ fn run(options: &EffectsOptions, scene: &Scene, scratch: &Path, interrupted: &At
         .process_group(0)
         .arg("run")
         .arg(&file)
-        .args(["--headless", "--duration", &format!("{}ms", options.duration.as_millis()), "--report"])
+        .args(["--headless", "--stages", "--duration", &format!("{}ms", options.duration.as_millis()), "--report"])
         .arg(&report)
         .stdin(Stdio::null())
         .stdout(log)

@@ -2,6 +2,7 @@
 //!
 //! | key | meaning |
 //! |---|---|
+//! | `command` | what was run |
 //! | `effort`, `took_s`, `load_1m`, `processor`, `threads` | `quick` or `full`; time on the wall; load at the end; what it ran on; 1 |
 //! | `curves[].name`, `engine`, `knob` | name for `--only`; crate; the registry's knob or null |
 //! | `curves[].title`, `error`, `unit`, `truth`, `timed`, `command` | what is turned, what is wrong by it and against what, what is timed, and the command that measures it again |
@@ -71,7 +72,9 @@ impl Front {
             let same: Vec<_> =
                 curve.subjects.iter().filter_map(|s| s.points.iter().find(|p| p.line == used && p.value == point.value)).collect();
             let mean = |of: &dyn Fn(&crate::Point) -> f64| same.iter().map(|p| of(p)).sum::<f64>() / same.len() as f64;
-            points.push(FrontPoint { value, time: mean(&|p| p.ratio.median), error: mean(&|p| p.error) });
+            // more digits than these mean nothing, and a file of them can be read
+            let round = |v: f64| format!("{v:.4e}").parse().unwrap_or(v);
+            points.push(FrontPoint { value, time: round(mean(&|p| p.ratio.median)), error: round(mean(&|p| p.error)) });
         }
         points.sort_by(|a, b| a.time.total_cmp(&b.time).then(a.error.total_cmp(&b.error)));
         let mut best = f64::INFINITY;
@@ -93,6 +96,7 @@ impl Front {
 #[derive(Clone, Debug, Serialize)]
 #[allow(missing_docs)] // the module's table says it
 pub struct Report {
+    pub command: String,
     pub effort: &'static str,
     pub took_s: f64,
     pub load_1m: f64,
@@ -111,7 +115,10 @@ impl Report {
     pub(crate) fn begin(options: &Options) -> Self {
         let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         let model = cpu.lines().find_map(|l| l.strip_prefix("model name")).and_then(|l| l.split(':').nth(1)).unwrap_or("unknown");
+        let volume = options.volume.as_ref().map_or(String::new(), |v| format!(" --volume {}", v.display()));
+        let only = if options.only.is_empty() { String::new() } else { format!(" --only {}", options.only.join(",")) };
         Self {
+            command: format!("maille tradeoff {}{only}{volume}", options.effort.option()),
             effort: options.effort.pick("quick", "full"),
             took_s: 0.0,
             load_1m: 0.0,
@@ -157,9 +164,15 @@ impl Report {
         self.fronts.iter().find(|f| f.name == name)
     }
 
-    /// The fronts alone, with what they were measured on: the file that a governor reads.
-    pub fn fronts_json(&self) -> serde_json::Value {
-        serde_json::json!({ "effort": self.effort, "processor": self.processor, "fronts": self.fronts })
+    /// The fronts alone, with what they were measured on and by which command, a line each: the file that a governor reads.
+    pub fn fronts_json(&self) -> String {
+        let lines: Vec<String> = self.fronts.iter().map(|f| format!("    {}", line(f))).collect();
+        format!(
+            "{{\n  \"command\": {},\n  \"processor\": {},\n  \"fronts\": [\n{}\n  ]\n}}\n",
+            line(&self.command),
+            line(&self.processor),
+            lines.join(",\n")
+        )
     }
 
     /// The object that `--json` prints.
@@ -205,6 +218,11 @@ pub(crate) fn marks(p: &crate::Point) -> String {
         words.push("= 1");
     }
     words.join(", ")
+}
+
+/// A value as JSON on one line.
+fn line(value: &impl Serialize) -> String {
+    serde_json::to_string(value).unwrap_or_default()
 }
 
 /// Load of the machine over the last minute.

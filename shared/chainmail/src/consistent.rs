@@ -12,7 +12,13 @@ use crate::{
     state::{Elements, Model},
 };
 use maille_volume::BrickSource;
-use std::collections::{BinaryHeap, HashMap, HashSet};
+use std::{
+    collections::{BinaryHeap, HashMap, HashSet},
+    hash::{BuildHasherDefault, DefaultHasher},
+};
+
+/// Hashes with keys of its own, not the process's: what a push takes is the same in every run, to the instruction.
+type Fixed = BuildHasherDefault<DefaultHasher>;
 
 /// Replaces the targets of one component, in place.
 pub fn make_consistent<S: BrickSource + ?Sized>(
@@ -51,7 +57,7 @@ fn envelope<S: BrickSource + ?Sized>(
     sign: f32,
 ) -> Vec<f32> {
     let floor = targets.iter().map(|t| sign * t).fold(f32::INFINITY, f32::min);
-    let mut best: HashMap<[usize; 3], f32> = HashMap::new();
+    let mut best: HashMap<[usize; 3], f32, Fixed> = HashMap::default();
     let mut heap = BinaryHeap::new();
     for (voxel, target) in voxels.iter().zip(targets) {
         let value = sign * target;
@@ -60,7 +66,7 @@ fn envelope<S: BrickSource + ?Sized>(
         heap.push((Ordered(value), *voxel));
     }
     // values only fall: what is popped is settled, and when all pins are, nothing that is left can matter
-    let mut unsettled: HashSet<[usize; 3]> = voxels.iter().copied().collect();
+    let mut unsettled: HashSet<[usize; 3], Fixed> = voxels.iter().copied().collect();
     let mut linked = [Neighbour::default(); MOST];
     while let Some((Ordered(value), voxel)) = heap.pop() {
         if value < best[&voxel] {

@@ -8,11 +8,11 @@ use crate::{
     cell::LatestCell,
     clock::SimulationClock,
     histogram::SharedHistogram,
-    messages::{DeviceForce, DeviceState, ToolCommand, ToolState, UndoCommand, ViewState},
+    messages::{DeviceForce, DeviceState, Stamp, ToolCommand, ToolState, UndoCommand, ViewState},
     names::PINS_PER_ROLE,
     needle::{NeedleLog, NeedleState},
 };
-use bytemuck::Zeroable;
+use bytemuck::{Pod, Zeroable};
 use core::sync::atomic::{
     AtomicU64,
     Ordering::{Acquire, Relaxed, Release},
@@ -128,6 +128,28 @@ pub enum Counter {
 /// Number of counters.
 pub const COUNTERS: usize = 24;
 
+/// Stages of a service's loop that can be timed; the registry of effects names them, in the order of the plan.
+pub const STAGES: usize = 16;
+
+/// Time spent in a stage, in a run whose stages are timed.
+#[repr(C)]
+#[derive(Zeroable)]
+pub struct StageCell {
+    /// times that it ran
+    pub count: AtomicU64,
+    /// time spent in it [ns]
+    pub total_ns: AtomicU64,
+}
+
+impl StageCell {
+    /// Counts one run. Only one process at a time counts for a role.
+    #[inline]
+    pub fn record(&self, ns: u64) {
+        self.count.store(self.count.load(Relaxed) + 1, Relaxed);
+        self.total_ns.store(self.total_ns.load(Relaxed) + ns, Relaxed);
+    }
+}
+
 /// One service's life and numbers. Writer: the service, but for `restarts` and `incarnation` (supervisor).
 #[repr(C)]
 #[derive(Zeroable)]
@@ -149,6 +171,8 @@ pub struct ServiceCell {
     pub duration: SharedHistogram,
     /// how late an iteration began (haptic) [ns]
     pub lateness: SharedHistogram,
+    /// its stages, in the plan's order, in a run whose stages are timed
+    pub stages: [StageCell; STAGES],
 }
 
 impl ServiceCell {
@@ -188,6 +212,63 @@ const fn words<T>() -> usize {
     size_of::<T>() / 8
 }
 
+/// Knobs that a [`KnobState`] has room for.
+pub const KNOB_CELLS: usize = 16;
+
+/// Settings of the knobs that turn while a scene runs (`accuracy = "auto"`), in the order of the scene registry's `LIVE_KNOBS`: every process
+/// of a run is the same program. Writer: supervisor. Readers: rendering, deformation, console.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct KnobState {
+    /// turns so far
+    pub turns: u64,
+    /// how many of them stand: what is given up now
+    pub given_up: u64,
+    /// bit n: `values[n]` holds; otherwise the scene's own value does
+    pub turned: u64,
+    /// settings
+    pub values: [f64; KNOB_CELLS],
+}
+
+impl KnobState {
+    /// A knob's setting, if it was turned and is a number.
+    pub fn get(&self, place: usize) -> Option<f64> {
+        let value = *self.values.get(place)?;
+        (self.turned >> place & 1 == 1 && value.is_finite()).then_some(value)
+    }
+
+    /// Turns a knob, or gives it back to the scene.
+    pub fn set(&mut self, place: usize, value: Option<f64>) {
+        let Some(cell) = self.values.get_mut(place) else { return };
+        *cell = value.unwrap_or(0.0);
+        self.turned = self.turned & !(1 << place) | u64::from(value.is_some()) << place;
+    }
+}
+
+/// Effects that are switched off while a scene runs. Writer: console. Readers: the processes that they run in.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct Switches {
+    /// sender's stamp
+    pub stamp: Stamp,
+    /// bit n: the n-th effect of the scene registry is off
+    pub off: u64,
+}
+
+impl Switches {
+    /// Whether the effect in this place of the registry is off.
+    pub fn is_off(&self, place: usize) -> bool {
+        place < 64 && self.off >> place & 1 == 1
+    }
+
+    /// Switches the effect in this place of the registry.
+    pub fn switch(&mut self, place: usize, on: bool) {
+        if place < 64 {
+            self.off = self.off & !(1 << place) | u64::from(!on) << place;
+        }
+    }
+}
+
 /// The control block.
 #[repr(C)]
 #[derive(Zeroable)]
@@ -205,6 +286,8 @@ pub struct ControlBlock {
     pub console_port: AtomicU64,
     /// smallest number of spare voxel slots seen so far. Writer: deformation
     pub spare_slots_low: AtomicU64,
+    /// 1 in a run whose stages are timed. Writer: supervisor, before any service starts
+    pub timed: AtomicU64,
     clock: LatestCell<{ words::<SimulationClock>() }>,
     /// last pose and force. Writer: haptic
     pub tool: LatestCell<{ words::<ToolState>() }>,
@@ -226,6 +309,10 @@ pub struct ControlBlock {
     pub needle: LatestCell<{ words::<NeedleState>() }>,
     /// what the needle did in this run. Writer: haptic
     pub needle_log: LatestCell<{ words::<NeedleLog>() }>,
+    /// settings of the knobs that turn live, in a scene with `accuracy = "auto"`. Writer: supervisor
+    pub knobs: LatestCell<{ words::<KnobState>() }>,
+    /// effects that are switched off live. Writer: console
+    pub switches: LatestCell<{ words::<Switches>() }>,
     /// what the page wants taken back. Writer: console
     pub undo: LatestCell<{ words::<UndoCommand>() }>,
     /// one for each [`Role`](crate::Role)
@@ -269,6 +356,26 @@ impl ControlBlock {
         held.then(|| self.tool.load::<ToolState>()).flatten().map(|(tool, _)| tool)
     }
 
+    /// Settings of the knobs, where they were turned since `seen`, the generation that it keeps.
+    pub fn turned_knobs(&self, seen: &mut u64) -> Option<KnobState> {
+        if self.knobs.generation() == *seen {
+            return None;
+        }
+        let (knobs, generation) = self.knobs.load::<KnobState>()?;
+        *seen = generation;
+        Some(knobs)
+    }
+
+    /// Effects that are off, where they were switched since `seen`, the generation that it keeps.
+    pub fn switched(&self, seen: &mut u64) -> Option<Switches> {
+        if self.switches.generation() == *seen {
+            return None;
+        }
+        let (switches, generation) = self.switches.load::<Switches>()?;
+        *seen = generation;
+        Some(switches)
+    }
+
     /// Whether a service should end: the run stops, or the supervisor no longer beats.
     pub fn should_end(&self, monotonic_ns: u64) -> bool {
         self.run_state() == RunState::Stopping
@@ -280,6 +387,27 @@ impl ControlBlock {
 mod tests {
     use super::*;
     use crate::Role;
+
+    #[test]
+    fn switches_are_each_for_itself() {
+        let mut switches = Switches::zeroed();
+        switches.switch(3, false);
+        switches.switch(7, false);
+        switches.switch(7, true);
+        switches.switch(64, false);
+        assert_eq!([2, 3, 7, 64].map(|n| switches.is_off(n)), [false, true, false, false]);
+    }
+
+    #[test]
+    fn a_knob_holds_what_it_was_set_to_and_the_others_what_they_were() {
+        let mut knobs = KnobState::zeroed();
+        knobs.set(3, Some(0.5));
+        knobs.set(5, Some(f64::NAN));
+        knobs.set(KNOB_CELLS, Some(1.0));
+        assert_eq!([2, 3, 5, KNOB_CELLS].map(|n| knobs.get(n)), [None, Some(0.5), None, None]);
+        knobs.set(3, None);
+        assert_eq!((knobs.get(3), knobs.turned), (None, 1 << 5));
+    }
 
     #[test]
     fn a_tool_that_nobody_holds_is_withdrawn() {

@@ -23,6 +23,6 @@ pub mod probe;
 pub mod segment_header;
 
 pub use breath::{BreathLead, BreathState, MotionHeader};
-pub use control::{ControlBlock, RunState, ServiceCell, ServiceState};
+pub use control::{ControlBlock, KnobState, RunState, ServiceCell, ServiceState, Switches};
 pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, UndoCommand, ViewState};
 pub use names::Role;

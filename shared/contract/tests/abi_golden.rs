@@ -4,8 +4,8 @@
 
 use iceoryx2::prelude::ZeroCopySend;
 use maille_contract::{
-    BreathLead, BreathState, Commit, ControlBlock, FrameHeader, MotionHeader, ServiceCell, Stamp, ToolCommand, ToolMove, ToolState,
-    UndoCommand, ViewState,
+    BreathLead, BreathState, Commit, ControlBlock, FrameHeader, KnobState, MotionHeader, ServiceCell, Stamp, Switches, ToolCommand,
+    ToolMove, ToolState, UndoCommand, ViewState,
     index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
     needle::{LabelsHeader, NeedleEvent, NeedleLog, NeedleState},
@@ -50,9 +50,11 @@ fn messages_keep_their_names_sizes_and_offsets() {
 
 #[test]
 fn shared_words_keep_their_sizes_and_offsets() {
-    golden!(ServiceCell, 18_688, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 240, lateness: 9_464);
+    golden!(ServiceCell, 18_944, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 240, lateness: 9_464, stages: 18_688);
     golden!(DeviceState, 88, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64);
     golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
+    golden!(KnobState, 152, turns: 0, given_up: 8, turned: 16, values: 24);
+    golden!(Switches, 32, stamp: 0, off: 24);
     golden!(UndoCommand, 32, stamp: 0, undos: 24);
     golden!(BreathLead, 88, since_ns: 0, base_ns: 8, speed: 16, mix: 40, slider: 64);
     golden!(BreathState, 216, stamp: 0, leads: 24, held: 200, led: 208);

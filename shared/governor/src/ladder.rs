@@ -36,6 +36,33 @@ pub struct Ladder {
     rungs: Vec<Rung>,
 }
 
+/// What stands at a setting: as it was measured, or straight between its neighbours.
+fn at<'a>(value: f64, points: impl Iterator<Item = &'a FrontPoint>) -> Option<FrontPoint> {
+    let (mut below, mut above): (Option<&FrontPoint>, Option<&FrontPoint>) = (None, None);
+    for p in points {
+        if p.value <= value && below.is_none_or(|b| p.value > b.value) {
+            below = Some(p);
+        }
+        if p.value >= value && above.is_none_or(|a| p.value < a.value) {
+            above = Some(p);
+        }
+    }
+    let (a, b) = below.zip(above)?;
+    let share = if b.value > a.value { (value - a.value) / (b.value - a.value) } else { 0.0 };
+    let mix = |of: fn(&FrontPoint) -> f64| of(a) + (of(b) - of(a)) * share;
+    Some(FrontPoint { value, time: mix(|p| p.time), error: mix(|p| p.error) })
+}
+
+/// Error of a setting: as it was measured, or straight between its neighbours; none outside what was measured.
+pub fn error_at(points: &[FrontPoint], value: f64) -> Option<f64> {
+    at(value, points.iter().filter(|p| p.value.is_finite() && p.time.is_finite() && p.error.is_finite())).map(|p| p.error)
+}
+
+/// Time of a setting over that of the reference, likewise.
+pub fn time_at(points: &[FrontPoint], value: f64) -> Option<f64> {
+    at(value, points.iter().filter(|p| p.value.is_finite() && p.time.is_finite() && p.error.is_finite())).map(|p| p.time)
+}
+
 /// Steps that save less than this are not worth a change that can be seen.
 const WORTH: f64 = 0.97;
 
@@ -51,11 +78,13 @@ impl Ladder {
     }
 
     /// Adds the rungs of a knob below those that are there: from the setting `from` down the front of `points`, as far as errors of `most`.
-    /// Points that others beat in both error and time, or that are no numbers, are left out; so are steps that save next to nothing.
+    /// Points that others beat in both error and time, or that are no numbers, are left out; so are steps that save next to nothing. Where
+    /// `from` itself was not measured, its time and error are taken straight between its neighbours; outside what was measured there is no rung.
     #[must_use]
     pub fn then(mut self, knob: &str, of: Loop, from: f64, most: f64, points: &[FrontPoint]) -> Self {
         let sound = |p: &&FrontPoint| p.value.is_finite() && p.time.is_finite() && p.time > 0.0 && p.error.is_finite();
-        let mut front: Vec<&FrontPoint> = points.iter().filter(sound).collect();
+        let start = at(from, points.iter().filter(sound));
+        let mut front: Vec<&FrontPoint> = points.iter().filter(sound).filter(|p| p.value != from).chain(&start).collect();
         let beaten = |p: &FrontPoint, q: &FrontPoint| q.time <= p.time && q.error <= p.error && (q.time < p.time || q.error < p.error);
         let all = front.clone();
         front.retain(|p| p.value == from || !all.iter().any(|q| beaten(p, q)));

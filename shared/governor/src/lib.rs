@@ -16,7 +16,7 @@
 
 mod ladder;
 
-pub use ladder::{FrontPoint, Ladder, Rung};
+pub use ladder::{FrontPoint, Ladder, Rung, error_at, time_at};
 
 /// A loop that can be relieved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -34,7 +34,7 @@ pub const PRESSED_S: f64 = 0.4;
 /// A setting is taken back where the load expected with it is below this.
 pub const CALM: f64 = 0.85;
 /// Shortest time of calm before that [s].
-pub const CALM_S: f64 = 0.6;
+pub const CALM_S: f64 = 0.4;
 /// After a turn nothing is judged for this time: the loads still show what was before [s].
 pub const SETTLE_S: f64 = 0.3;
 /// A climb that is followed by pressure within this time was wrong [s].

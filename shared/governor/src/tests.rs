@@ -60,6 +60,17 @@ fn rungs_lie_on_the_front_below_where_one_starts_and_within_the_error_allowed() 
 }
 
 #[test]
+fn a_start_between_two_settings_that_were_measured_has_the_rungs_below_it() {
+    let step = points(&[(0.5, 2.0, 0.1), (1.0, 1.0, 0.2), (2.0, 0.5, 0.8)]);
+    let rungs = |from: f64| Ladder::new().then("k", Loop::Rendering, from, 1.0, &step).rungs().to_vec();
+    let [down] = &rungs(1.5)[..] else { panic!("one step down from between the last two") };
+    // half-way: 0.75 of the time
+    assert!((down.finer, down.coarser) == (1.5, 2.0) && (down.saves - 0.5 / 0.75).abs() < 1e-12, "{down:?}");
+    assert_eq!(rungs(0.7).iter().map(|r| r.coarser).collect::<Vec<_>>(), [1.0, 2.0]);
+    assert_eq!((rungs(0.4).len(), rungs(3.0).len(), rungs(f64::NAN).len()), (0, 0, 0), "nothing is known there");
+}
+
+#[test]
 fn a_machine_that_holds_its_deadlines_is_left_alone() {
     let mut machine = Machine::new();
     machine.run(60.0, 0.99, 0.5);

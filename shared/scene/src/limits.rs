@@ -73,6 +73,7 @@ pub static LIMITS: &[Limit] = limits! {
     deformation.sampling_order: 1 ..= 3 [""] |s| Some(s.deformation.sampling_order.into());
     deformation.metric: 0 ..= 1 [""] |s| Some(if s.deformation.metric == crate::sections::Metric::Cubic { 0.0 } else { 1.0 });
     deformation.rate_hz: 1 ..= 1000 ["Hz"] |s| Some(s.deformation.rate_hz);
+    deformation.floor_hz: 1 ..= 1000 ["Hz"] |s| Some(s.deformation.floor_hz);
     deformation.threads: 1 ..= 256 [""] |s| s.deformation.threads.map(|n| n as f64);
     haptic.rate_hz: 100 ..= 4000 ["Hz"] |s| Some(s.haptic.rate_hz);
     haptic.max_force_n: 0.1 ..= 40 ["N"] |s| Some(s.haptic.max_force_n);
@@ -86,6 +87,8 @@ pub static LIMITS: &[Limit] = limits! {
     haptic.cpu: 0 ..= 1023 [""] |s| s.haptic.cpu.map(|n| n as f64);
     haptic.priority: 0 ..= 99 [""] |s| Some(s.haptic.priority.into());
     rendering.rate_hz: 1 ..= 240 ["Hz"] |s| Some(s.rendering.rate_hz);
+    rendering.floor_hz: 1 ..= 240 ["Hz"] |s| Some(s.rendering.floor_hz);
+    rendering.scale: 0.25 ..= 1 [""] |s| Some(s.rendering.scale);
     rendering.fov_deg: 1 ..= 170 ["°"] |s| Some(s.rendering.fov_deg);
     rendering.endoscope_fov_deg: 1 ..= 170 ["°"] |s| Some(s.rendering.endoscope_fov_deg);
     rendering.endoscope_barrel: 0 ..= 2 [""] |s| Some(s.rendering.endoscope_barrel);

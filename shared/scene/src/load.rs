@@ -291,6 +291,13 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let message = format!("bone_hu = {} is not above threshold_hu = {}", scene.deformation.bone_hu, scene.deformation.threshold_hu);
         faults.push(document.fault("deformation.bone_hu", message, "below the threshold", help));
     }
+    let (d, r) = (&scene.deformation, &scene.rendering);
+    for (path, floor, rate) in [("deformation.floor_hz", d.floor_hz, d.rate_hz), ("rendering.floor_hz", r.floor_hz, r.rate_hz)] {
+        if document.span(path).is_some() && floor > rate {
+            let help = Some("the floor is the rate below which accuracy is given up: use a number up to rate_hz".into());
+            faults.push(document.fault(path, format!("floor_hz = {floor} is above rate_hz = {rate}"), "above the rate", help));
+        }
+    }
     if let Some(profile) = scene.device.profile.as_ref().filter(|p| !PROFILES.iter().any(|known| known.eq_ignore_ascii_case(p))) {
         let help = Some(format!("profiles are {}", PROFILES.join(", ")));
         faults.push(document.fault("device.profile", suggest::unknown("profile", profile, PROFILES), "no such profile", help));
@@ -490,10 +497,10 @@ fn check_tissues(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
 }
 
 fn check_effects(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
-    let names: Vec<&str> = registry::EFFECTS.iter().filter(|e| e.called_by == CalledBy::Effects).map(|e| e.name).collect();
+    let names: Vec<&str> = registry::effects().filter(|e| e.called_by == CalledBy::Effects).map(|e| e.name).collect();
     for (name, setting) in &scene.effects {
         let path = format!("effects.{name}");
-        let Some(effect) = registry::EFFECTS.iter().find(|e| e.name == *name && e.called_by == CalledBy::Effects) else {
+        let Some(effect) = registry::effects().find(|e| e.name == *name && e.called_by == CalledBy::Effects) else {
             let help = Some(format!("effects are {}", names.join(", ")));
             faults.push(document.fault(&path, suggest::unknown("effect", name, &names), "no such effect", help));
             continue;

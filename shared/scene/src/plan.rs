@@ -12,7 +12,7 @@
 
 use crate::{
     limits,
-    registry::{CalledBy, Channel, DISPLACEMENT, EFFECTS, Effect, KNOBS, Knob, Process, Stage, VOXELS},
+    registry::{self, CalledBy, Channel, DISPLACEMENT, Effect, KNOBS, Knob, Process, Stage, VOXELS},
     scene::Scene,
 };
 use maille_volume::{
@@ -88,7 +88,7 @@ const CONTROL_BYTES: u64 = 100 * 1024;
 
 /// Derives the plan of a scene on a volume of this grid.
 pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
-    let effects: Vec<&'static Effect> = EFFECTS.iter().filter(|e| is_active(e, scene)).collect();
+    let effects: Vec<&'static Effect> = registry::effects().filter(|e| is_active(e, scene)).collect();
     let wants = |process: Process| effects.iter().any(|e| e.processes.contains(&process));
     let mut processes = Vec::new();
     for process in [Process::Deformation, Process::Haptic, Process::Rendering] {
@@ -171,6 +171,16 @@ impl Plan {
     /// The plan of one process.
     pub fn process(&self, process: Process) -> Option<&ProcessPlan> {
         self.processes.iter().find(|p| p.process == process)
+    }
+
+    /// Whether an effect that runs in a process can be switched live.
+    pub fn can_switch(&self, process: Process) -> bool {
+        self.effects.iter().any(|e| e.live && e.processes.contains(&process))
+    }
+
+    /// Names of a process's stages, in order.
+    pub fn stage_names(&self, process: Process) -> Vec<&'static str> {
+        self.process(process).map_or(Vec::new(), |p| p.stages.iter().map(|s| s.name).collect())
     }
 
     /// Whether an effect is active.

@@ -6,6 +6,7 @@
 
 use crate::{scene::Scene, sections::Metric};
 use maille_volume::brick::{Brick, EDGE};
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 /// A process that a plan may start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -137,7 +138,7 @@ pub struct Effect {
     pub settings: &'static [&'static str],
     /// inputs on which it must stay finite and bounded, each a named test
     pub hard_cases: &'static [&'static str],
-    /// whether it can be switched while the scene runs
+    /// whether a scene that calls for it may switch it off and on again while it runs; a matter of one process alone
     pub live: bool,
     /// false: declared for later
     pub available: bool,
@@ -190,7 +191,7 @@ pub static EFFECTS: &[Effect] = &[
         stages: &[
             stage(Process::Haptic, "device", Per::Tick),
             stage(Process::Haptic, "contact", Per::Tick),
-            stage(Process::Haptic, "force limits", Per::Tick),
+            stage(Process::Haptic, "hand over", Per::Tick),
         ],
         panels: &["force"],
         hard_cases: &["stiffness up to the passivity bound", "frozen deformation", "thin and noisy surfaces", "leaving the volume"],
@@ -229,6 +230,7 @@ pub static EFFECTS: &[Effect] = &[
         processes: &[Process::Deformation],
         channels: &[&DISPLACEMENT],
         stages: &[stage(Process::Deformation, "relaxation", Per::Step)],
+        live: true,
         depends_on: &["deformation"],
         hard_cases: &["a push in the middle of it", "links of any stiffness", "restart half-way"],
         ..Effect::named("relaxation", "tissue creeps back towards rest while no tool touches it")
@@ -309,6 +311,7 @@ pub static EFFECTS: &[Effect] = &[
         processes: &[Process::Rendering],
         stages: &[stage(Process::Rendering, "ultrasound", Per::Frame)],
         panels: &["ultrasound"],
+        live: true,
         depends_on: &["contact"],
         hard_cases: &["a probe in the air", "bone and gas before tissue", "a probe that looks nowhere"],
         ..Effect::named("ultrasound", "what a probe at the tool's tip would see, made from CT")
@@ -318,9 +321,30 @@ pub static EFFECTS: &[Effect] = &[
     Effect::later("recording", "a record that can be replayed", &[]),
 ];
 
+/// Place in [`EFFECTS`] of one that counts as not registered; beyond the end: none does.
+static LEFT_OUT: AtomicUsize = AtomicUsize::new(usize::MAX);
+
+/// All effects that are registered: what plans and scenes are made from.
+pub fn effects() -> impl Iterator<Item = &'static Effect> {
+    let left_out = LEFT_OUT.load(Relaxed);
+    EFFECTS.iter().enumerate().filter(move |(place, _)| *place != left_out).map(|(_, e)| e)
+}
+
+/// Takes an effect out of the registry of this process, or puts the last one back: for measuring that its absence costs nothing.
+#[doc(hidden)]
+pub fn leave_out(name: Option<&str>) {
+    let place = name.and_then(|name| EFFECTS.iter().position(|e| e.name == name));
+    LEFT_OUT.store(place.unwrap_or(usize::MAX), Relaxed);
+}
+
+/// Place of an effect in the registry: how processes name one to each other.
+pub fn place(name: &str) -> Option<usize> {
+    EFFECTS.iter().position(|e| e.name == name)
+}
+
 /// The effect of a name.
 pub fn effect(name: &str) -> Option<&'static Effect> {
-    EFFECTS.iter().find(|e| e.name == name)
+    effects().find(|e| e.name == name)
 }
 
 /// Something that trades accuracy for time.
@@ -357,6 +381,17 @@ pub static KNOBS: &[Knob] = &[
         cost: "frame time grows as 1/step",
         get: |s| s.rendering.step,
         set: |s, v| s.rendering.step = v,
+    },
+    Knob {
+        name: "rendering.scale",
+        effect: "view",
+        summary: "share of the full width and height at which the 3D view is drawn; scaled up by straight interpolation",
+        defaults: [0.5, 1.0, 1.0],
+        error: "difference of the picture [part of full scale]",
+        truth: "the same picture drawn whole, at step 0.1",
+        cost: "frame time grows as its square",
+        get: |s| s.rendering.scale,
+        set: |s, v| s.rendering.scale = v,
     },
     Knob {
         name: "rendering.opacity_end",
@@ -495,10 +530,41 @@ pub static KNOBS: &[Knob] = &[
     },
 ];
 
+/// Knobs that may turn while a scene runs, each with the loop that it relieves, in the order in which accuracy is given up. Between two frames or
+/// two steps none of them moves tissue that stands or changes a limit of its links, so none can be felt. Not here, because they would: offset and
+/// metric (links that held would hold no more), whatever the haptic loop does. A service reads them by their place in this list.
+pub static LIVE_KNOBS: &[(&str, Process)] = &[
+    ("rendering.step", Process::Rendering),
+    ("breathing.picture_tolerance_mm", Process::Rendering),
+    ("rendering.scale", Process::Rendering),
+    ("rendering.opacity_end", Process::Rendering),
+    ("deformation.sampling_order", Process::Deformation),
+    ("deformation.inversion_tolerance_mm", Process::Deformation),
+];
+
+/// The knob of a name.
+pub fn knob(name: &str) -> Option<&'static Knob> {
+    KNOBS.iter().find(|k| k.name == name)
+}
+
+/// Place of a knob among those that may turn live.
+pub fn live_knob(name: &str) -> Option<usize> {
+    LIVE_KNOBS.iter().position(|(live, _)| *live == name)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::limits::limit;
+
+    #[test]
+    fn knobs_that_turn_live_are_registered_and_turn_a_loop_that_their_effect_has() {
+        for (name, process) in LIVE_KNOBS {
+            let knob = knob(name).unwrap_or_else(|| panic!("{name} is no knob"));
+            let effect = effect(knob.effect).unwrap();
+            assert!(effect.processes.contains(process), "{name} relieves {}, where {} does not run", process.service(), knob.effect);
+        }
+    }
 
     #[test]
     fn every_knob_has_a_range_that_holds_its_defaults_and_reads_what_it_writes() {

@@ -22,17 +22,28 @@ pub enum Accuracy {
     Balanced,
     /// as good as the engines can
     Reference,
+    /// begins as `balanced`; while it runs, knobs that may turn live give way where a loop would miss its deadline
+    Auto,
 }
 
 impl Accuracy {
     /// 0, 1, 2: where this setting stands in a knob's list of defaults.
     pub fn index(self) -> usize {
-        self as usize
+        match self {
+            Self::Draft => 0,
+            Self::Balanced | Self::Auto => 1,
+            Self::Reference => 2,
+        }
     }
 
     /// The word in the scene file.
     pub fn name(self) -> &'static str {
-        ["draft", "balanced", "reference"][self.index()]
+        match self {
+            Self::Draft => "draft",
+            Self::Balanced => "balanced",
+            Self::Reference => "reference",
+            Self::Auto => "auto",
+        }
     }
 }
 

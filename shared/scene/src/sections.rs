@@ -81,6 +81,8 @@ pub struct Deformation {
     pub sampling_order: u32,
     /// at most so many commits a second [Hz], 1 to 1000
     pub rate_hz: f64,
+    /// with `accuracy = "auto"`: accuracy is given up where fewer commits a second could be made [Hz], 1 to 1000
+    pub floor_hz: f64,
     /// threads of the process; by default a share of the machine's cores
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<usize>,
@@ -103,6 +105,7 @@ impl Default for Deformation {
             inversion_tolerance_mm: 0.01,
             sampling_order: 1,
             rate_hz: 60.0,
+            floor_hz: 12.0,
             threads: None,
         }
     }
@@ -214,6 +217,8 @@ pub struct Rendering {
     pub section_size: [usize; 2],
     /// frames a second at most [Hz], 1 to 240
     pub rate_hz: f64,
+    /// with `accuracy = "auto"`: accuracy is given up where fewer frames a second could be drawn [Hz], 1 to 240
+    pub floor_hz: f64,
     /// what the 3D view shows
     pub mode: Mode,
     /// preset (`ct`, `bone`, `soft-tissue`, `lung`, `skin`) or a file with a transfer function
@@ -246,6 +251,8 @@ pub struct Rendering {
     pub backend: Backend,
     /// while things move, draw the 3D view with fewer pixels and longer steps where that is needed to hold `rate_hz`; at rest it is whole
     pub adapt: bool,
+    /// share of the full width and height at which the 3D view is drawn, 0.25 to 1 (a knob)
+    pub scale: f64,
     /// gradient shading
     pub shading: bool,
     /// a ray ends when this part of the light is used up, 0.5 to 1 (a knob)
@@ -266,6 +273,7 @@ impl Default for Rendering {
             size: [640, 480],
             section_size: [320, 240],
             rate_hz: 30.0,
+            floor_hz: 12.0,
             mode: Mode::Volume,
             transfer: "ct".into(),
             camera: CameraKind::Free,
@@ -281,6 +289,7 @@ impl Default for Rendering {
             step: 1.0,
             backend: Backend::Cpu,
             adapt: true,
+            scale: 1.0,
             shading: true,
             opacity_end: 0.99,
             section_window_hu: [50.0, 800.0],

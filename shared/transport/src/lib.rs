@@ -18,6 +18,7 @@ pub mod events;
 pub mod life;
 pub mod messages;
 pub mod segment;
+pub mod stages;
 
 pub use domain::Domain;
 pub use events::{Event, Listener, Notifier};
@@ -25,6 +26,7 @@ pub use life::Life;
 pub use maille_realtime::monotonic_ns;
 pub use messages::{FramePublisher, FrameSample, FrameSubscriber, Message, Node, Publisher, Services, Subscriber, Topic, frame_pool_bytes};
 pub use segment::{Access, ControlMap, Segment};
+pub use stages::{Stopwatch, Timed, Untimed, timed};
 
 use std::path::PathBuf;
 use thiserror::Error;

@@ -16,6 +16,8 @@ export class Picture {
     on("window-center", "input", (e) => ({ window_center_hu: e.valueAsNumber }));
     on("window-width", "input", (e) => ({ window_width_hu: e.valueAsNumber }));
     on("follow", "change", (e) => ({ sections_follow_tool: e.checked }));
+    // effects that the scene lets be switched, as the server names them
+    $("effects").addEventListener("change", (e) => model.link.send({ type: "effect", name: e.target.name, on: e.target.checked }));
     $("reset-camera").onclick = () => mouse.resetCamera();
   }
 
@@ -24,8 +26,9 @@ export class Picture {
     $("camera-tip").disabled = $("follow").disabled = !model.facts.has_tool;
   }
 
-  state({ view }) {
+  state({ view, state }) {
     if (!view) return;
+    this.effects(state?.effects ?? []);
     const press = (id, on) => $(id).setAttribute("aria-pressed", on);
     press("mode-volume", view.mode === 0); press("mode-surface", view.mode === 1);
     press("camera-free", view.camera === 0); press("camera-tip", view.camera === 1);
@@ -35,5 +38,20 @@ export class Picture {
     $("window-center-now").textContent = `${view.window_center_hu.toFixed(0)} HU`;
     $("window-width-now").textContent = `${view.window_width_hu.toFixed(0)} HU`;
     $("follow").checked = view.sections_follow_tool;
+  }
+
+  effects(list) {
+    const names = list.map(([name]) => name).join();
+    if (names !== this.names) {
+      this.names = names;
+      $("effects").hidden = list.length === 0;
+      $("effects").replaceChildren(...list.map(([name]) => {
+        const label = document.createElement("label"), box = document.createElement("input");
+        box.type = "checkbox"; box.name = name; box.id = `effect-${name}`;
+        label.append(box, ` ${name}`);
+        return label;
+      }));
+    }
+    for (const [name, on] of list) if (document.activeElement !== $(`effect-${name}`) || on) $(`effect-${name}`).checked = on;
   }
 }

@@ -23,6 +23,9 @@ export class Services {
       cell(s.p50_us > 0 ? times(s.p50_us, s.p99_us) : "–").title = s.p50_us > 0 ? `largest ${times(s.max_us)}, ${s.overruns} overruns` : "";
       return row;
     }));
+    const given = state.given_up;
+    $("governor").hidden = !given;
+    if (given) $("governor").textContent = "accuracy auto: " + (given.map(([knob, value]) => `${knob} = ${+value.toPrecision(3)}`).join(", ") || "nothing given up");
     $("refused").textContent = state.refused > 0 ? `${state.refused} requests refused` : "";
   }
 }

@@ -17,6 +17,7 @@ export class Views {
 
   async show(frame) {
     await Promise.all(Object.entries(frame.views).map(async ([name, v]) => this.byName[name].put(await createImageBitmap(v.jpeg))));
+    for (const view of this.list) if (!(view.name in frame.views)) view.clear();
     this.draw();
   }
 
@@ -57,6 +58,11 @@ export class View {
     this.pixels.drawImage(bitmap, 0, 0);
     this.element.hidden = false; // a view that few scenes have is there once it has a picture
     bitmap.close();
+  }
+
+  // The scene has no such view, or it is switched off: nothing of it is kept.
+  clear() {
+    if (this.image.width > 4) { this.image.width = 4; this.image.height = 3; }
   }
 
   get isSection() { return this.name in PLANES; }

@@ -7,6 +7,7 @@ mod mapper;
 mod motion;
 mod needle;
 mod raycast;
+mod ultrasound;
 mod vif;
 mod warp;
 
@@ -21,6 +22,7 @@ pub fn all() -> impl Iterator<Item = &'static Curve> {
         motion::CURVES,
         raycast::CURVES,
         warp::CURVES,
+        ultrasound::CURVES,
         vif::CURVES,
         contact::CURVES,
         needle::CURVES,

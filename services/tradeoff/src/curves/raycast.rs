@@ -56,9 +56,9 @@ pub(super) static CURVES: &[Curve] = &[
         bench: |c| subjects(c, normals),
     },
     Curve {
-        name: "raycast.scale",
+        name: "rendering.scale",
         engine: "raycast",
-        knob: KnobOf::Engine(None),
+        knob: KnobOf::Registry("rendering.scale"),
         title: "share of the full width and height that is drawn while things move; scaled up by straight interpolation",
         error: ERROR,
         unit: "%",

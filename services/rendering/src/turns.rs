@@ -1,0 +1,37 @@
+//! Frames one by one, without the loop's rate and its publishing: for measuring what a frame takes. The calling thread's pool draws.
+
+use crate::{RenderingError, breath::Breather, compose::Composer, view::View};
+use maille_breathing::Patient;
+use maille_contract::ToolState;
+use maille_scene::{BoxMm, Scene};
+use maille_store::Reader;
+use maille_transport::{ControlMap, Domain, Untimed};
+
+/// A composer that draws when it is told to.
+pub struct Turns<'a> {
+    control: ControlMap,
+    reader: &'a Reader,
+    composer: Composer,
+    view: View,
+    breather: Option<Breather<'a>>,
+}
+
+impl<'a> Turns<'a> {
+    /// In a domain that lives.
+    ///
+    /// # Errors
+    /// As the process itself.
+    pub fn open(domain: &Domain, scene: &Scene, reader: &'a Reader, patient: Option<Patient<'a>>) -> Result<Self, RenderingError> {
+        let view = View::new(scene, &BoxMm::of(&reader.info().grid))?;
+        let breather = patient.map(|patient| Breather::new(patient, reader.info(), scene.breathing.picture_tolerance_mm));
+        Ok(Self { control: ControlMap::open(domain)?, reader, composer: Composer::new(scene), view, breather })
+    }
+
+    /// Draws the newest state at a simulation time; false where the view could not be drawn.
+    pub fn frame(&mut self, time_ns: u64) -> bool {
+        let tool = self.control.tool.load::<ToolState>().map(|(tool, _)| tool);
+        let snapshot = self.reader.snapshot();
+        let warp = self.breather.as_mut().map(|breather| breather.go(time_ns));
+        self.composer.draw(&snapshot, warp, &self.view, tool.as_ref(), tool.is_some(), None, &mut Untimed).is_ok()
+    }
+}

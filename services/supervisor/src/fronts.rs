@@ -1,0 +1,97 @@
+//! Measured fronts of error against time, as `maille tradeoff` writes them (`fronts.json`): those that come with the program, or a machine's own.
+//!
+//! Times are ratios, which differ little from machine to machine, so the file that comes with the program serves where nobody has measured.
+
+use crate::SupervisorError;
+use maille_governor::FrontPoint;
+use serde::Deserialize;
+use std::{fs, path::Path};
+
+/// Those that come with the program; `command` in it says how they were made.
+const OWN: &str = include_str!("../../../config/fronts.json");
+
+/// Points of a knob's front.
+#[derive(Clone, Debug, Deserialize)]
+struct Front {
+    /// the registry's knob, where it is one
+    knob: Option<String>,
+    points: Vec<Point>,
+}
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+struct Point {
+    value: f64,
+    time: f64,
+    error: f64,
+}
+
+/// Fronts by knob.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Fronts {
+    /// how they were measured
+    #[serde(default)]
+    pub command: String,
+    fronts: Vec<Front>,
+    /// where they come from, for reports
+    #[serde(skip)]
+    pub source: String,
+}
+
+impl Fronts {
+    /// Of a file, or those that come with the program.
+    ///
+    /// # Errors
+    /// When the file cannot be read or is not what `maille tradeoff` writes.
+    pub fn open(file: Option<&Path>) -> Result<Self, SupervisorError> {
+        let (text, source) = match file {
+            None => (OWN.to_owned(), "the fronts that come with the program".to_owned()),
+            Some(path) => {
+                let text =
+                    fs::read_to_string(path).map_err(SupervisorError::io(format!("the fronts {} cannot be read", path.display())))?;
+                (text, path.display().to_string())
+            }
+        };
+        let read: Self = serde_json::from_str(&text).map_err(|e| {
+            SupervisorError::Refused(format!("{source} holds no fronts ({e}); `maille tradeoff --quick -o DIR` writes DIR/fronts.json"))
+        })?;
+        Ok(Self { source, ..read })
+    }
+
+    /// Points of a knob's front, from cheap to dear; none where it was not measured.
+    pub fn of(&self, knob: &str) -> Option<Vec<FrontPoint>> {
+        let front = self.fronts.iter().find(|f| f.knob.as_deref() == Some(knob))?;
+        Some(front.points.iter().map(|p| FrontPoint { value: p.value, time: p.time, error: p.error }).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maille_governor::error_at;
+    use maille_scene::registry::{LIVE_KNOBS, knob};
+
+    #[test]
+    fn the_fronts_of_the_program_hold_every_knob_that_turns_live_down_to_draft() {
+        let fronts = Fronts::open(None).unwrap();
+        assert!(fronts.command.starts_with("maille tradeoff"), "{}", fronts.command);
+        for (name, _) in LIVE_KNOBS {
+            let points = fronts.of(name).unwrap_or_else(|| panic!("{name} has no front"));
+            let [draft, balanced, _] = knob(name).unwrap().defaults;
+            assert!(error_at(&points, balanced).is_some(), "{name}: nothing is known of {balanced}: {points:?}");
+            let between = |p: &&FrontPoint| (balanced.min(draft)..=balanced.max(draft)).contains(&p.value) && p.value != balanced;
+            assert!(balanced == draft || points.iter().any(|p| between(&p)), "{name}: nothing between {balanced} and {draft}: {points:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_file_of_fronts_is_refused_with_the_command_that_makes_one() {
+        let path = std::env::temp_dir().join(format!("maille-fronts-{}.json", std::process::id()));
+        for text in ["", "{}", "{\"fronts\": [{\"points\": [{\"value\": null}]}]}"] {
+            fs::write(&path, text).unwrap();
+            let said = Fronts::open(Some(&path)).unwrap_err().to_string();
+            assert!(said.contains("maille tradeoff") && said.contains("fronts"), "{said}");
+        }
+        fs::remove_file(&path).unwrap();
+        assert!(Fronts::open(Some(&path)).is_err());
+    }
+}

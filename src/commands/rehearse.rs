@@ -1,0 +1,334 @@
+//! What a scene costs on this machine: a short run of it with the stages of its loops timed, for `maille check`.
+//!
+//! The scene runs as `maille run` would run it, in a domain of its own, without a page and without a real device (the scene's script moves the
+//! tool). Times are of that run: they hold what its processes take from each other, and what else the machine does meanwhile.
+//!
+//! **Headroom** of a loop is 1 − time of a turn (99th percentile) over its period. A loop **holds** its rate when its median turn fits into the period,
+//! and the haptic loop when it misses no more than five ticks in a thousand. Where one does not, or holds it only by drawing less, it is said which
+//! knob would save most (by measured fronts, down to `draft`) and which effect costs most there.
+
+use maille_governor::{FrontPoint, time_at};
+use maille_scene::{
+    Device, EffectSetting, Plan, Process, Scene, Waypoints,
+    registry::{CalledBy, Per},
+};
+use maille_supervisor::fronts::Fronts;
+use serde_json::{Value, json};
+use std::{
+    fs,
+    os::unix::process::CommandExt as _,
+    path::PathBuf,
+    process::{Command, Stdio},
+    time::{Duration, Instant},
+};
+
+/// The first second of a run is not counted.
+const WARM_UP_S: f64 = 1.0;
+/// What is counted: a round of the tool, but within these [s].
+const COUNTED_S: [f64; 2] = [2.0, 5.0];
+/// How long a run may take beyond its time before it counts as stuck [s].
+const PATIENCE_S: f64 = 60.0;
+/// Share of ticks that may be missed: 1000 ± 5 Hz.
+const MISSED: f64 = 0.005;
+/// A knob that saves less is not named.
+const WORTH: f64 = 0.97;
+/// Share of coarser frames from which on it is said that a rate is only held so.
+const OFTEN: f64 = 0.1;
+
+/// A stage of a loop.
+pub struct StageCost {
+    /// name, as in the plan
+    pub name: String,
+    /// effect that it belongs to
+    pub effect: &'static str,
+    /// mean time [µs]
+    pub us: f64,
+}
+
+/// A loop as it ran.
+pub struct LoopCost {
+    /// its process
+    pub process: Process,
+    /// tick, step or frame
+    pub turn: Per,
+    /// median time of a turn [µs]
+    pub p50_us: f64,
+    /// 99th percentile [µs]
+    pub p99_us: f64,
+    /// its period [µs]
+    pub period_us: f64,
+    /// turns a second that were seen; for a loop that turns only when there is something to do, those that its median turn would allow, at most the rate
+    pub rate_hz: f64,
+    /// whether it holds its rate
+    pub holds: bool,
+    /// share of frames drawn more coarsely than the scene asks for, to be in time
+    pub coarse_share: f64,
+    /// its stages
+    pub stages: Vec<StageCost>,
+}
+
+impl LoopCost {
+    /// 1 − p99 over the period.
+    pub fn headroom(&self) -> f64 {
+        1.0 - self.p99_us / self.period_us
+    }
+}
+
+/// What was measured.
+pub struct Costs {
+    /// length of the run [s]
+    pub seconds: f64,
+    /// load of the machine before it
+    pub load_1m: f64,
+    /// its loops
+    pub loops: Vec<LoopCost>,
+    /// what to do, a sentence each; empty when all rates hold
+    pub advice: Vec<String>,
+}
+
+/// Runs the scene and reads its report.
+pub fn rehearse(scene: &Scene, plan: &Plan, way: Option<&Waypoints>, fronts: &Fronts) -> Result<Costs, String> {
+    let mut scene = scene.clone();
+    scene.console.enabled = false;
+    if let Some(tool) = scene.tool.as_mut().filter(|tool| !matches!(tool.device, Device::Path | Device::Sim)) {
+        tool.device = Device::Path;
+    }
+    if let Some(file) = &scene.volume.file {
+        scene.volume.file = Some(fs::canonicalize(file).map_err(|e| format!("{} cannot be found: {e}", file.display()))?);
+    }
+    let counted = way.map_or(COUNTED_S[0], Waypoints::period_s).clamp(COUNTED_S[0], COUNTED_S[1]);
+    let seconds = WARM_UP_S + counted;
+    let load_1m = fs::read_to_string("/proc/loadavg").ok().and_then(|t| t.split(' ').next()?.parse().ok()).unwrap_or(0.0);
+    let report = run(&scene, seconds)?;
+    let loops: Vec<LoopCost> = plan.processes.iter().filter_map(|p| cost(&report, plan, p.process, p.rate_hz?)).collect();
+    let advice = loops.iter().filter_map(|l| advice(l, &scene, plan, fronts)).collect();
+    Ok(Costs { seconds, load_1m, loops, advice })
+}
+
+/// Files that go with the value.
+struct Scratch(PathBuf);
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// A run by this program; its report.
+fn run(scene: &Scene, seconds: f64) -> Result<Value, String> {
+    let scratch = Scratch(std::env::temp_dir().join(format!("maille-check-{}", std::process::id())));
+    let failed = |what: &str, e: &dyn std::fmt::Display| format!("the scene could not be tried out: {what}: {e}");
+    fs::create_dir_all(&scratch.0).map_err(|e| failed("no folder for it", &e))?;
+    let [file, report, said] = ["scene.toml", "run.json", "run.log"].map(|name| scratch.0.join(name));
+    fs::write(&file, scene.to_toml()).map_err(|e| failed("its file", &e))?;
+    let log = fs::File::create(&said).map_err(|e| failed("its log", &e))?;
+    let and = log.try_clone().map_err(|e| failed("its log", &e))?;
+    let mut child = Command::new("/proc/self/exe")
+        .arg0("maille")
+        .arg("run")
+        .arg(&file)
+        .args(["--headless", "--stages", "--duration", &format!("{}ms", (seconds * 1e3).round()), "--report"])
+        .arg(&report)
+        .stdin(Stdio::null())
+        .stdout(log)
+        .stderr(and)
+        .spawn()
+        .map_err(|e| failed("the run does not start", &e))?;
+    let deadline = Instant::now() + Duration::from_secs_f64(seconds + PATIENCE_S);
+    let status = loop {
+        match child.try_wait().map_err(|e| failed("the run cannot be waited for", &e))? {
+            Some(status) => break status,
+            None if Instant::now() > deadline => {
+                // Ctrl-C on the terminal reaches it too, so it ends as a run does
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(failed("the run did not end", &format!("{PATIENCE_S:.0} s too long")));
+            }
+            None => std::thread::sleep(Duration::from_millis(10)),
+        }
+    };
+    let last = || {
+        let log = fs::read_to_string(&said).unwrap_or_default();
+        log.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("nothing").to_owned()
+    };
+    if !status.success() {
+        return Err(failed(&status.to_string(), &last()));
+    }
+    let text = fs::read_to_string(&report).map_err(|e| failed("its report", &e))?;
+    serde_json::from_str(&text).map_err(|e| failed("its report", &e))
+}
+
+fn cost(report: &Value, plan: &Plan, process: Process, asked_hz: f64) -> Option<LoopCost> {
+    let own = &report["services"][process.service()];
+    let n = |path: &str| own.pointer(path).and_then(Value::as_f64).unwrap_or(0.0);
+    let (turn, key, us) = match process {
+        Process::Haptic => (Per::Tick, "/tick_us", 1.0),
+        Process::Deformation => (Per::Step, "/step_us", 1.0),
+        Process::Rendering => (Per::Frame, "/frame_ms", 1e3),
+        Process::Console => return None,
+    };
+    let (p50_us, p99_us) = (us * n(&format!("{key}/p50")), us * n(&format!("{key}/p99")));
+    let period_us = 1e6 / asked_hz;
+    let (rate_hz, holds) = match process {
+        Process::Haptic => (n("/rate_hz"), n("/overruns") <= MISSED * (n("/ticks") + n("/overruns"))),
+        _ => (asked_hz.min(if p50_us > 0.0 { 1e6 / p50_us } else { asked_hz }), p50_us <= period_us),
+    };
+    let owner =
+        |stage: &str| plan.effects.iter().find(|e| e.stages.iter().any(|s| s.process == process && s.name == stage)).map_or("", |e| e.name);
+    let stages = own["stages"].as_array().into_iter().flatten();
+    let stages = stages.filter_map(|s| {
+        let name = s["name"].as_str()?;
+        Some(StageCost { name: name.to_owned(), effect: owner(name), us: s["us"].as_f64()? })
+    });
+    let coarse_share = n("/coarse_frames") / n("/frames").max(1.0);
+    Some(LoopCost { process, turn, p50_us, p99_us, period_us, rate_hz, holds, coarse_share, stages: stages.collect() })
+}
+
+/// What to do about a loop that does not hold its rate, or only by drawing less.
+fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<String> {
+    let rate = 1e6 / l.period_us;
+    let service = l.process.service();
+    let trouble = match l.process {
+        _ if l.p50_us == 0.0 => return None,
+        Process::Haptic if !l.holds => format!("haptic will miss ticks: {:.1} of {rate:.0} a second were made", l.rate_hz),
+        _ if !l.holds => format!(
+            "{service} will not hold its {rate:.0} Hz: a {} takes {}, and there are {}",
+            l.turn.name(),
+            time(l.p50_us),
+            time(l.period_us)
+        ),
+        Process::Rendering if l.coarse_share > OFTEN => {
+            format!(
+                "rendering holds its {rate:.0} Hz by drawing {:.0} % of the frames with fewer pixels or longer steps",
+                100.0 * l.coarse_share
+            )
+        }
+        _ => return None,
+    };
+    // what is missing at the hand is taken by others
+    let eased = if l.process == Process::Haptic { Process::Rendering } else { l.process };
+    let mut knobs: Vec<(f64, String)> = plan
+        .knobs
+        .iter()
+        .filter(|(knob, _)| plan.effects.iter().any(|e| e.name == knob.effect && e.processes.contains(&eased)))
+        .filter_map(|(knob, value)| {
+            let points: Vec<FrontPoint> = fronts.of(knob.name)?;
+            let saves = time_at(&points, knob.defaults[0])? / time_at(&points, *value)?;
+            (saves < WORTH).then(|| (saves, format!("`{}` = {} ({:.0} % of the time)", knob.name, knob.defaults[0], 100.0 * saves)))
+        })
+        .collect();
+    knobs.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut stages: Vec<&StageCost> = l
+        .stages
+        .iter()
+        .filter(|s| {
+            let switchable = plan.effects.iter().any(|e| e.name == s.effect && e.called_by == CalledBy::Effects);
+            switchable && scene.effects.get(s.effect).is_some_and(EffectSetting::is_on) && s.us > 0.05 * l.p50_us
+        })
+        .collect();
+    stages.sort_by(|a, b| b.us.total_cmp(&a.us));
+    let mut ways: Vec<String> = knobs.into_iter().take(2).map(|(_, text)| format!("turn {text}")).collect();
+    ways.extend(stages.first().map(|s| format!("switch off `{}` ({} a {})", s.effect, time(s.us), l.turn.name())));
+    ways.push(match l.process {
+        Process::Haptic => "leave a core to it".to_owned(),
+        _ => format!("ask for less than {rate:.0} Hz (`{service}.rate_hz`)"),
+    });
+    Some(format!("{trouble}: {}", ways.join("; or ")))
+}
+
+/// A time in the unit that fits.
+pub fn time(us: f64) -> String {
+    match us {
+        us if us >= 9_950.0 => format!("{:.0} ms", us * 1e-3),
+        us if us >= 995.0 => format!("{:.1} ms", us * 1e-3),
+        us if us >= 9.95 => format!("{us:.0} µs"),
+        us => format!("{us:.1} µs"),
+    }
+}
+
+impl Costs {
+    /// Lines for people.
+    pub fn lines(&self) -> Vec<String> {
+        let mut out =
+            vec![format!("measured here in {:.0} s of this scene, load {:.1} (--no-measure leaves it out)", self.seconds, self.load_1m)];
+        out.push(format!("  {:<12} {:<6} {:>8} {:>8} {:>8} {:>9}  stages, mean", "loop", "turn", "p50", "p99", "period", "headroom"));
+        for l in &self.loops {
+            if l.p50_us == 0.0 {
+                out.push(format!("  {:<12} {:<6} none in this time", l.process.service(), l.turn.name()));
+                continue;
+            }
+            let stages: Vec<String> = l.stages.iter().map(|s| format!("{} {}", s.name, time(s.us))).collect();
+            out.push(format!(
+                "  {:<12} {:<6} {:>8} {:>8} {:>8} {:>7.0} %  {}",
+                l.process.service(),
+                l.turn.name(),
+                time(l.p50_us),
+                time(l.p99_us),
+                time(l.period_us),
+                100.0 * l.headroom(),
+                stages.join(", ")
+            ));
+        }
+        match self.advice.is_empty() {
+            true => out.push("  all loops hold their rates here".into()),
+            false => out.extend(self.advice.iter().map(|a| format!("  {a}"))),
+        }
+        out
+    }
+
+    /// The same for programs.
+    pub fn to_json(&self) -> Value {
+        let stage = |s: &StageCost| json!({ "name": s.name, "effect": s.effect, "us": s.us });
+        let one = |l: &LoopCost| {
+            json!({ "service": l.process.service(), "turn": l.turn.name(), "p50_us": l.p50_us, "p99_us": l.p99_us, "period_us": l.period_us,
+                    "headroom": l.headroom(), "rate_hz": l.rate_hz, "holds": l.holds, "coarse_share": l.coarse_share,
+                    "stages": l.stages.iter().map(stage).collect::<Vec<_>>() })
+        };
+        json!({ "seconds": self.seconds, "load_1m": self.load_1m, "loops": self.loops.iter().map(one).collect::<Vec<_>>(), "advice": self.advice })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maille_scene::{Machine, plan::plan};
+    use maille_volume::Grid;
+
+    fn told(rendering: Value) -> Costs {
+        let scene = Scene::builtin_default();
+        let plan = plan(&scene, &Grid::axis_aligned([64; 3], [1.0; 3]), Machine { cores: 2 });
+        let report = json!({ "services": {
+            "haptic": { "tick_us": { "p50": 10.0, "p99": 30.0 }, "ticks": 3000, "overruns": 0, "rate_hz": 1000.0,
+                        "stages": [{ "name": "contact", "count": 3000, "us": 8.0 }] },
+            "rendering": rendering } });
+        let loops: Vec<LoopCost> = plan.processes.iter().filter_map(|p| cost(&report, &plan, p.process, p.rate_hz?)).collect();
+        let fronts = Fronts::open(None).unwrap();
+        let advice = loops.iter().filter_map(|l| advice(l, &scene, &plan, &fronts)).collect();
+        Costs { seconds: 3.0, load_1m: 0.0, loops, advice }
+    }
+
+    #[test]
+    fn a_loop_that_does_not_hold_its_rate_is_told_with_a_knob_and_an_effect_that_would_help() {
+        let stages = json!([{ "name": "ray casting", "count": 9, "us": 40_000.0 }, { "name": "sections", "count": 9, "us": 12_000.0 }]);
+        let costs = told(json!({ "frame_ms": { "p50": 52.0, "p99": 60.0 }, "frames": 100, "stages": stages }));
+        let [advice] = &costs.advice[..] else { panic!("one loop is late: {:?}", costs.advice) };
+        for word in ["will not hold its 30 Hz", "52 ms", "`rendering.scale`", "switch off `sections` (12 ms a frame)"] {
+            assert!(advice.contains(word), "{word} is not in {advice}");
+        }
+        let [_, haptic, rendering] = &costs.loops[..] else { panic!("three loops") };
+        assert!(haptic.holds && (haptic.headroom() - 0.97).abs() < 1e-12 && haptic.stages[0].effect == "contact");
+        assert!(!rendering.holds && rendering.headroom() < 0.0 && (rendering.rate_hz - 1e3 / 52.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_rate_that_is_held_needs_no_advice_unless_it_is_held_by_drawing_less() {
+        assert!(told(json!({ "frame_ms": { "p50": 20.0, "p99": 30.0 }, "frames": 100 })).advice.is_empty());
+        let less = told(json!({ "frame_ms": { "p50": 27.0, "p99": 30.0 }, "frames": 100, "coarse_frames": 60 }));
+        assert!(less.advice[0].contains("drawing 60 % of the frames"), "{:?}", less.advice);
+    }
+
+    #[test]
+    fn times_have_the_unit_that_fits() {
+        assert_eq!([0.25, 12.3, 999.0, 4_200.0, 33_333.0].map(time), ["0.2 µs", "12 µs", "1.0 ms", "4.2 ms", "33 ms"]);
+    }
+}
