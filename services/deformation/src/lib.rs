@@ -10,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 mod announce;
+mod drag;
 mod incise;
 #[cfg(test)]
 mod recovery;
@@ -68,6 +69,7 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }
     let mut engine = step::Engine::new(&scene, reader.info());
+    let mut drag = drag::Drag::new(&scene);
     restore::restore(&mut engine, &writer);
     life.ready();
     if writer.epoch() > FIRST_EPOCH {
@@ -112,6 +114,12 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
             last_step = now;
             announcer.step(&mut life, &done, now, None);
             continue;
+        }
+        if let Some(drag) = drag.as_mut().filter(|_| due)
+            && let Some(done) = drag.follow(&mut engine, life.control(), now, &reader, &mut writer)
+        {
+            last_step = now;
+            announcer.step(&mut life, &done, now, None);
         }
         let Some(message) = due.then(|| moves.latest()).flatten() else {
             let tool = life.control().held_tool(now).filter(|tool| tool.flags & TOOL_IN_CONTACT != 0);

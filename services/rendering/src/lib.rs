@@ -19,7 +19,7 @@ mod needle;
 mod overlay;
 mod view;
 
-use maille_contract::needle::NeedleState;
+use maille_contract::needle::{NeedleLog, NeedleState};
 use maille_contract::{FrameHeader, Role, ServiceCell, ToolState, control::Counter};
 use maille_raycast::{FrameBudget, Quality};
 use maille_scene::{BoxMm, Machine, Scene};
@@ -100,9 +100,9 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
             life.cell().count(Counter::Refused, 1);
         }
         // a patient who breathes is another one in every frame
-        let time_ns = life.control().time_ns(now);
-        let moment = breather.as_ref().map_or(0, |_| time_ns);
         let needle = if has_needle { life.control().needle.load::<NeedleState>().map(|(needle, _)| needle) } else { None };
+        let time_ns = needle::moment(needle.as_ref(), life.control().time_ns(now));
+        let moment = breather.as_ref().map_or(0, |_| time_ns);
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
         let seen = (reader.epoch(), view.generation(), tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
         let moving = shown != Some(seen);
@@ -122,7 +122,8 @@ pub fn run(domain: &str) -> Result<(), RenderingError> {
         let snapshot = reader.snapshot();
         if let Some(needle) = &needle {
             let to_world = |at| breather.as_ref().map_or(at, |breather| breather.to_world(time_ns, at));
-            needle::bodies(needle, to_world, &mut bodies);
+            let log = life.control().needle_log.load::<NeedleLog>().map(|(log, _)| log);
+            needle::bodies(needle, log.as_ref(), to_world, &mut bodies);
         }
         let drawn = pool.install(|| {
             let warp = breather.as_mut().map(|breather| breather.go(time_ns));
