@@ -73,7 +73,11 @@ pub fn run(args: &Args) -> Outcome {
     for (name, meaning, bytes) in breath.iter().flat_map(Prepared::segments) {
         plan.add_region(name, meaning, bytes);
     }
-    let labels = maille_supervisor::needle::labels_bytes(&scene);
+    if scene.volume.labels.is_some() {
+        // refused here as the run would
+        maille_supervisor::labels::of(&scene, grid).map_err(|e| Failure::Refused(e.to_string()))?;
+    }
+    let labels = maille_supervisor::labels::bytes(&scene, grid);
     if labels > 0 {
         plan.add_region("region-labels", "labels at rest", labels);
     }

@@ -10,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 mod announce;
+mod drag;
 mod incise;
 #[cfg(test)]
 mod recovery;
@@ -91,6 +92,7 @@ fn steps<W: Stopwatch>(
     watch: W,
 ) {
     let mut engine = step::Engine::new(scene, reader.info(), watch);
+    let mut drag = drag::Drag::new(scene);
     restore::restore(&mut engine, &writer);
     life.ready();
     if writer.epoch() > FIRST_EPOCH {
@@ -140,11 +142,17 @@ fn steps<W: Stopwatch>(
         }
         if due
             && let Some((command, _)) = life.control().undo.load::<UndoCommand>()
-            && let Some(done) = engine.undo(command.undos, &reader, &mut writer)
+            && let Some(done) = engine.undo(command.undos, reader, &mut writer)
         {
             last_step = now;
             announcer.step(&mut life, &done, now, None);
             continue;
+        }
+        if let Some(drag) = drag.as_mut().filter(|_| due)
+            && let Some(done) = drag.follow(&mut engine, life.control(), now, reader, &mut writer)
+        {
+            last_step = now;
+            announcer.step(&mut life, &done, now, None);
         }
         let Some(message) = due.then(|| moves.latest()).flatten() else {
             let tool = life.control().held_tool(now).filter(|tool| tool.flags & TOOL_IN_CONTACT != 0);

@@ -12,6 +12,7 @@
 mod breath;
 mod device;
 mod needle;
+mod needle_port;
 mod operator;
 mod outbox;
 mod publisher;

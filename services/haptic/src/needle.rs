@@ -3,17 +3,19 @@
 //! Numerics are `maille-needle`'s; here is what it knows nothing of: which tissue is where, which limits the device has, what is told to others. It
 //! takes the place of contact by proxies in scenes that have it. Tissue: the label at the nearest voxel where the patient has labels, else the
 //! CT value, trilinear; the first row of the scene's table that fits. Labels are those of rest: tissue that was pushed aside takes only its CT
-//! values with it.
+//! values with it. Where a file brings labels of its own, what they do not name is known by its CT value. Tissue is always that of rest: what the
+//! needle drags along is the same tissue elsewhere.
 //!
 //! Frame: world; inside the patient the reference space of `maille-needle`. Degraded modes: a pose that is stale or invalid → the last one stands
 //! and the force fades; a run that ends → the force fades. Cost: the needle's tick, and a look-up of tissue or two. Allocation: none after `new`.
 
 use crate::HapticError;
+use crate::needle_port::NeedlePort;
 use maille_contact::{DevicePose, ForceShaper, Limits, TickOutputs};
 use maille_contract::ControlBlock;
 use maille_contract::needle::{
-    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleEvent,
-    NeedleLog, NeedleState,
+    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag,
+    NeedleEvent, NeedleLog, NeedleState,
 };
 use maille_needle::{
     AIR, Breathing, Capsule, EventKind, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q,
@@ -28,6 +30,8 @@ use maille_volume::{BrickSource, Grid, Sampler};
 const MAX_TORQUE_N_MM: f64 = 150.0;
 /// Ticks between two words to the log.
 const LOG_EVERY: u64 = 100;
+/// Ticks between two words to deformation: it commits no more than so often.
+const DRAG_EVERY: u64 = 20;
 /// A pose older than this fades the force [s].
 const MAX_POSE_AGE_S: f64 = 0.02;
 
@@ -35,6 +39,8 @@ const MAX_POSE_AGE_S: f64 = 0.02;
 struct Rows {
     by_label: [u8; 256],
     by_value: Vec<([f64; 2], u8)>,
+    /// what labels do not name is known by its value
+    partly: bool,
     labels: Option<Region<LabelsHeader>>,
     grid: Grid,
 }
@@ -55,12 +61,15 @@ impl<S: BrickSource> Tissue for Seen<'_, S> {
         if !(0..3).all(|c| index[c] >= 0.0 && index[c] <= (size[c] - 1) as f64) {
             return AIR;
         }
-        if self.labels.is_empty() {
-            let value = self.sampler.value(reference).unwrap_or(f64::NEG_INFINITY);
-            return self.rows.by_value.iter().find(|([low, high], _)| value >= *low && value < *high).map_or(AIR, |(_, row)| *row);
+        if !self.labels.is_empty() {
+            let [i, j, k] = index.map(|v| (v + 0.5) as usize);
+            let row = self.labels.get((k * size[1] + j) * size[0] + i).map_or(AIR, |&label| self.rows.by_label[usize::from(label)]);
+            if row != AIR || !self.rows.partly {
+                return row;
+            }
         }
-        let [i, j, k] = index.map(|v| (v + 0.5) as usize);
-        self.labels.get((k * size[1] + j) * size[0] + i).map_or(AIR, |&label| self.rows.by_label[usize::from(label)])
+        let value = self.sampler.value(reference).unwrap_or(f64::NEG_INFINITY);
+        self.rows.by_value.iter().find(|([low, high], _)| value >= *low && value < *high).map_or(AIR, |(_, row)| *row)
     }
 }
 
@@ -92,6 +101,24 @@ pub(crate) struct NeedleStage {
     log: NeedleLog,
     ticks: u64,
     path_reference: Vec<V3>,
+    /// what goes through the handle: energy of force and torque
+    port: NeedlePort,
+    /// in a scene in which tissue is dragged along
+    drag: Option<Box<Dragged>>,
+    /// what the tick's rod left [1e-12 mm]
+    residual: Option<u64>,
+    /// faults counted so far by this process
+    faults: [u64; 5],
+    /// the deepest path has grown since it was taken down, and how deep it was then [mm]
+    path_grew: bool,
+    path_told_mm: f64,
+}
+
+/// How tissue is dragged along, with room to gather it in.
+struct Dragged {
+    told: NeedleDrag,
+    gathered: Vec<[V3; 2]>,
+    due: bool,
 }
 
 impl NeedleStage {
@@ -112,8 +139,10 @@ impl NeedleStage {
         let (config, gauge) = config(n, &limits).map_err(fail)?;
         let materials: Vec<Material> = n.tissue.iter().map(material).collect();
         let tool = NeedleTool::new(config, MaterialTable::new(&materials).map_err(fail)?).map_err(fail)?;
-        let labels = scene.volume.file.is_none().then(|| Region::open(domain, LABELS_REGION, LABELS_KIND)).transpose()?;
-        let mut rows = Rows { by_label: [AIR; 256], by_value: Vec::new(), labels, grid: grid.clone() };
+        let has_labels = scene.volume.file.is_none() || scene.volume.labels.is_some();
+        let labels = has_labels.then(|| Region::open(domain, LABELS_REGION, LABELS_KIND)).transpose()?;
+        let partly = scene.volume.labels.is_some();
+        let mut rows = Rows { by_label: [AIR; 256], by_value: Vec::new(), partly, labels, grid: grid.clone() };
         for (row, tissue) in n.tissue.iter().enumerate().rev() {
             tissue.labels.iter().for_each(|&l| rows.by_label[usize::from(l)] = row as u8 + 1);
         }
@@ -122,7 +151,8 @@ impl NeedleStage {
         let most_n_mm = device_torque_n_mm.map_or(MAX_TORQUE_N_MM, |device| device.min(MAX_TORQUE_N_MM));
         let torque = Limits { max_force_n: most_n_mm, max_slew_n_per_s: 50.0 * most_n_mm, ..limits };
         let mut log: NeedleLog = bytemuck::Zeroable::zeroed();
-        log.to_target_mm = [f64::NAN; 2];
+        log.to_target_mm = [f64::NAN; 3];
+        let dragged = || Dragged { told: bytemuck::Zeroable::zeroed(), gathered: Vec::with_capacity(room), due: false };
         Ok(Some(Self {
             tool,
             rows,
@@ -136,6 +166,12 @@ impl NeedleStage {
             log,
             ticks: 0,
             path_reference: Vec::with_capacity(room),
+            port: NeedlePort::default(),
+            drag: scene.has_effect("needle-drag").then(|| Box::new(dragged())),
+            residual: None,
+            faults: [0; 5],
+            path_grew: false,
+            path_told_mm: 0.0,
         }))
     }
 
@@ -144,6 +180,7 @@ impl NeedleStage {
         if let Some((log, _)) = control.needle_log.load::<NeedleLog>() {
             self.log = log;
         }
+        self.port.balance_mj = self.log.port_mj[0];
     }
 
     /// One tick.
@@ -159,8 +196,13 @@ impl NeedleStage {
         let force_n = self.force.shape(out.force_n, step, fading);
         let torque_n_mm = self.torque.shape(out.torque_n_mm, step, fading);
         self.ticks += 1;
+        self.drag(moment.now_ns, breathing);
+        // where tissue gives way the needle is seen where the hand has it
+        let ahead = if self.drag.is_some() { self.tool.ahead() } else { V3::zeros() };
+        let out = Outputs { tip_mm: (V3::from(out.tip_mm) + ahead).into(), ..out };
+        self.port.pass(&handle, moment.held, force_n, torque_n_mm);
         self.note(moment, dt, &out, force_n, torque_n_mm);
-        self.draw(moment.now_ns, &out, torque_n_mm);
+        self.draw(moment.now_ns, &out, torque_n_mm, ahead);
         TickOutputs {
             force_n,
             torque_n_mm,
@@ -197,6 +239,13 @@ impl NeedleStage {
     /// Tells the shape, and now and then the log.
     pub fn publish(&mut self, control: &ControlBlock) {
         control.needle.store(&self.state);
+        if let Some(residual) = self.residual.take() {
+            control.needle_residual.record(residual);
+        }
+        if let Some(drag) = self.drag.as_mut().filter(|drag| drag.due) {
+            drag.due = false;
+            control.needle_drag.store(&drag.told);
+        }
         if self.ticks.is_multiple_of(LOG_EVERY) || self.log.events_changed(control) {
             control.needle_log.store(&self.log);
         }
@@ -235,13 +284,32 @@ impl NeedleStage {
             log.ticks_inside += 1;
             log.inside_ns += (dt * 1e9) as u64;
             log.residual_mm = log.residual_mm.max(out.solved.residual_mm);
+            self.residual = Some((out.solved.residual_mm * 1e12) as u64);
+            log.slowed[0] += u64::from(out.solved.slowed > 0);
+            log.slowed[1] += u64::from(!out.solved.converged);
         }
+        let f = &out.faults;
+        let now = [f.jumps, f.path_full, f.buried, f.invalid_breathing, f.invalid_poses];
+        // a process that was restarted counts from nought
+        (0..5).for_each(|n| log.faults[n] += now[n] - self.faults[n]);
+        self.faults = now;
+        log.port_mj = [self.port.balance_mj, log.port_mj[1].min(self.port.balance_mj)];
+        // outside there is no distance to tell
+        log.to_target_mm[0] = f64::NAN;
         if let (Some(target), true) = (self.target, out.path_nodes > 1) {
             let now = (V3::from(out.tip_reference_mm) - target).norm();
-            log.to_target_mm = [now, log.to_target_mm[1].min(now)];
+            let deepest = if out.depth_mm > log.deepest_mm { now } else { log.to_target_mm[2] };
+            log.to_target_mm = [now, log.to_target_mm[1].min(now), deepest];
         }
-        if out.depth_mm > log.deepest_mm && (out.depth_mm > log.deepest_mm + 0.5 || self.ticks.is_multiple_of(LOG_EVERY)) {
+        if out.depth_mm > log.deepest_mm {
             log.deepest_mm = out.depth_mm;
+            self.path_grew = true;
+        }
+        // the path of that depth: taken down every so often, and before it is lost
+        if self.path_grew
+            && (out.depth_mm > self.path_told_mm + 0.5 || out.depth_mm < log.deepest_mm || self.ticks.is_multiple_of(LOG_EVERY))
+        {
+            (self.path_grew, self.path_told_mm) = (false, log.deepest_mm);
             log.path_nodes = fill(&mut log.path_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
         }
         for event in out.events.iter().flatten() {
@@ -264,12 +332,22 @@ impl NeedleStage {
         }
     }
 
-    fn draw(&mut self, now_ns: u64, out: &Outputs, torque_n_mm: [f64; 3]) {
+    /// What deformation is told.
+    fn drag<B: Breathing>(&mut self, now_ns: u64, breathing: &B) {
+        let Some(drag) = self.drag.as_mut().filter(|_| self.ticks.is_multiple_of(DRAG_EVERY)) else { return };
+        let Dragged { told, gathered, due } = &mut **drag;
+        self.tool.drag(breathing, gathered);
+        (told.time_ns, told.radius_mm, *due) = (now_ns, self.radius_mm, true);
+        told.count = fill(&mut told.path_mm, gathered.iter().map(|[at, _]| *at), &mut self.path_reference) as u64;
+        fill(&mut told.by_mm, gathered.iter().map(|[_, by]| *by), &mut self.path_reference);
+    }
+
+    fn draw(&mut self, now_ns: u64, out: &Outputs, torque_n_mm: [f64; 3], ahead: V3) {
         let s = &mut self.state;
         (s.time_ns, s.tissue, s.radius_mm) = (now_ns, out.material.into(), self.radius_mm);
         (s.depth_mm, s.ahead_mm, s.residual_mm, s.torque_n_mm) = (out.depth_mm, out.ahead_mm, out.solved.residual_mm, torque_n_mm);
         s.parts_n = [out.cutting_n, out.friction_n, out.base_n];
-        s.nodes = fill(&mut s.nodes_mm, self.tool.nodes().iter().copied(), &mut self.path_reference) as u64;
+        s.nodes = fill(&mut s.nodes_mm, self.tool.nodes().iter().map(|n| n + ahead), &mut self.path_reference) as u64;
         s.path_nodes = fill(&mut s.path_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
     }
 }

@@ -187,16 +187,17 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         let (orientation, held) = (self.operator.orientation(), !self.operator.is_let_go());
         let Some(stage) = &mut self.needle else { return [0.0; 3] };
         let snapshot = self.reader.snapshot();
+        let rest = self.reader.rest();
         let mut moment = needle::Moment { now_ns, pose, pose_age_s, orientation, held, release, phase: -1.0 };
         let out = match &self.breather {
             Some(breather) => {
                 let (field, phase) = breather.field(now_ns);
                 moment.phase = phase;
-                let out = stage.tick(&snapshot, &field, &moment);
+                let out = stage.tick(&rest, &field, &moment);
                 (self.residual_mm, self.unmapped) = (field.residual_mm.get(), held && pose.valid && field.residual_mm.get().is_none());
                 out
             }
-            None => stage.tick(&snapshot, &maille_needle::AtRest, &moment),
+            None => stage.tick(&rest, &maille_needle::AtRest, &moment),
         };
         stage.publish(control);
         self.watch.split("needle");

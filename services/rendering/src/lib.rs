@@ -21,7 +21,7 @@ mod overlay;
 pub mod turns;
 mod view;
 
-use maille_contract::needle::NeedleState;
+use maille_contract::needle::{NeedleLog, NeedleState};
 use maille_contract::{FrameHeader, Role, ServiceCell, ToolState, control::Counter};
 use maille_raycast::FrameBudget;
 use maille_scene::{Accuracy, BoxMm, Machine, Plan, Scene, registry::live_knob};
@@ -140,9 +140,9 @@ fn frames<W: Stopwatch + Send>(
             life.cell().count(Counter::Refused, 1);
         }
         // a patient who breathes is another one in every frame
-        let time_ns = life.control().time_ns(now);
-        let moment = breather.as_ref().map_or(0, |_| time_ns);
         let needle = if has_needle { life.control().needle.load::<NeedleState>().map(|(needle, _)| needle) } else { None };
+        let time_ns = needle::moment(needle.as_ref(), life.control().time_ns(now));
+        let moment = breather.as_ref().map_or(0, |_| time_ns);
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
         let asked = (view.generation(), view.turns());
         let seen = (reader.epoch(), asked, tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
@@ -163,7 +163,8 @@ fn frames<W: Stopwatch + Send>(
         let snapshot = reader.snapshot();
         if let Some(needle) = &needle {
             let to_world = |at| breather.as_ref().map_or(at, |breather| breather.to_world(time_ns, at));
-            needle::bodies(needle, to_world, &mut bodies);
+            let log = life.control().needle_log.load::<NeedleLog>().map(|(log, _)| log);
+            needle::bodies(needle, log.as_ref(), to_world, &mut bodies);
         }
         let drawn = pool.install(|| {
             watch.start();

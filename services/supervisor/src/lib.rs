@@ -24,8 +24,10 @@ pub mod enter;
 mod error;
 pub mod fronts;
 pub mod governor;
+pub mod labels;
 pub mod memory;
 pub mod needle;
+mod needle_plot;
 mod output;
 mod patient;
 mod process;
@@ -36,6 +38,7 @@ mod simulation;
 pub mod stale;
 #[doc(hidden)]
 pub mod still;
+pub mod trace;
 mod watch;
 
 pub use enter::enter;
@@ -150,6 +153,13 @@ fn finish(report: RunReport, options: &RunOptions) -> Result<RunReport, Supervis
         let mut text = serde_json::to_string_pretty(&report).expect("a report is strings and finite numbers");
         text.push('\n');
         fs::write(path, text).map_err(|source| SupervisorError::Report { path: path.clone(), source })?;
+        if let Some(needle) = report.needle.as_ref().filter(|n| !n.trace.time_s.is_empty()) {
+            // beside the report, under its name
+            let plot = path.with_extension("svg");
+            fs::write(&plot, needle_plot::svg(&report.scene, needle))
+                .map_err(|source| SupervisorError::Report { path: plot.clone(), source })?;
+            say!("forces plotted in {}", plot.display());
+        }
     }
     if !report.services.is_empty() {
         say!("{report}");

@@ -1,42 +1,15 @@
-//! What a scene with a needle needs before it runs (labels of the patient at rest) and what is told of it at the end.
+//! What is told of a needle at the end of a run.
 
-use crate::SupervisorError;
+use crate::{
+    report::Durations,
+    trace::{Trace, TraceReport},
+};
 use maille_contract::{
     ControlBlock,
-    needle::{LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleLog},
+    needle::{NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleLog},
 };
-use maille_phantom::{Kind, Phantom};
-use maille_scene::{PhantomKind, Scene, VolumeSource};
-use maille_store::{Region, StoreKeeper};
-use maille_transport::Domain;
+use maille_scene::Scene;
 use serde::Serialize;
-
-/// Bytes of the labels of a scene with a needle in a made patient; 0 where there are none. A patient from a file has none: its tissue is known by
-/// CT value.
-pub fn labels_bytes(scene: &Scene) -> u64 {
-    match scene.volume.source() {
-        VolumeSource::Phantom { size, .. } if scene.has_effect("needle") => {
-            Region::<LabelsHeader>::segment_bytes(size.iter().product::<usize>()) as u64
-        }
-        _ => 0,
-    }
-}
-
-/// Makes the region of labels, where the scene has one.
-pub fn publish_labels(scene: &Scene, keeper: &mut StoreKeeper, domain: &Domain) -> Result<(), SupervisorError> {
-    let VolumeSource::Phantom { kind, size, seed } = scene.volume.source() else { return Ok(()) };
-    if labels_bytes(scene) == 0 {
-        return Ok(());
-    }
-    let kind = match kind {
-        PhantomKind::Head => Kind::Head,
-        PhantomKind::Torso => Kind::Torso,
-    };
-    let labels = Phantom::new(kind, seed).labels(size);
-    let header = LabelsHeader { size: size.map(|n| n as u64) };
-    keeper.add_region(domain, LABELS_REGION, LABELS_KIND, &header, labels.len(), |to| to.copy_from_slice(&labels))?;
-    Ok(())
-}
 
 /// Something that happened to the tip.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -59,21 +32,48 @@ pub struct Touched {
 pub struct NeedleReport {
     pub inside_s: f64,
     pub deepest_mm: f64,
+    /// at the end of the run; null: the needle was out
     pub tip_to_target_mm: Option<f64>,
     pub closest_to_target_mm: Option<f64>,
+    pub deepest_to_target_mm: Option<f64>,
+    pub withdrawn: bool,
     pub target_reached: Option<bool>,
     pub forbidden_touched: Vec<String>,
     pub peak_force_n: f64,
     pub peak_torque_n_mm: f64,
     pub worst_residual_mm: f64,
+    /// of the rod's solve, every tick inside
+    pub residual_mm: Durations,
+    pub ticks_inside: u64,
+    /// ticks whose rod was made anew against more drag, because it did not arrive within its bound
+    pub ticks_slowed: u64,
+    /// ticks whose rod was given out short of its tolerance
+    pub ticks_unconverged: u64,
+    pub faults: FaultsReport,
+    /// energy that went from the hand into the needle's side: at the end, and least [mJ]
+    pub port_energy_mj: f64,
+    pub port_energy_least_mj: f64,
     pub events: Vec<Touched>,
     pub events_not_kept: u64,
     pub path_mm: Vec<[f32; 3]>,
+    /// forces over time
+    pub trace: TraceReport,
+}
+
+/// What was wrong with what came in, in ticks or times.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[allow(missing_docs)] // the report's table says it
+pub struct FaultsReport {
+    pub jumps: u64,
+    pub path_full: u64,
+    pub buried: u64,
+    pub invalid_breathing: u64,
+    pub invalid_poses: u64,
 }
 
 impl NeedleReport {
     /// From the log that haptic left; `None` in a scene without a needle.
-    pub fn of(scene: &Scene, control: &ControlBlock) -> Option<Self> {
+    pub(crate) fn of(scene: &Scene, control: &ControlBlock, trace: Option<Trace>) -> Option<Self> {
         let log = scene.has_effect("needle").then(|| control.needle_log.load::<NeedleLog>()).flatten()?.0;
         let kept = (log.count as usize).min(NEEDLE_EVENTS);
         let rows = &scene.needle.tissue;
@@ -99,20 +99,31 @@ impl NeedleReport {
         let mut forbidden: Vec<String> = events.iter().filter(|e| e.forbidden).map(|e| e.tissue.clone()).collect();
         forbidden.sort_unstable();
         forbidden.dedup();
+        let [jumps, path_full, buried, invalid_breathing, invalid_poses] = log.faults;
         let distance = |mm: f64| mm.is_finite().then_some(mm);
         Some(Self {
             inside_s: log.inside_ns as f64 * 1e-9,
             deepest_mm: log.deepest_mm,
             tip_to_target_mm: distance(log.to_target_mm[0]),
             closest_to_target_mm: distance(log.to_target_mm[1]),
+            deepest_to_target_mm: distance(log.to_target_mm[2]),
+            withdrawn: log.ticks_inside > 0 && events.last().is_some_and(|e| e.what == "withdrawn"),
             target_reached: distance(log.to_target_mm[1]).map(|mm| mm <= scene.needle.target_radius_mm),
             forbidden_touched: forbidden,
             peak_force_n: log.peaks[0],
             peak_torque_n_mm: log.peaks[1],
             worst_residual_mm: log.residual_mm,
+            residual_mm: Durations::of(&control.needle_residual, 1e12),
+            ticks_inside: log.ticks_inside,
+            ticks_slowed: log.slowed[0],
+            ticks_unconverged: log.slowed[1],
+            faults: FaultsReport { jumps, path_full, buried, invalid_breathing, invalid_poses },
+            port_energy_mj: log.port_mj[0],
+            port_energy_least_mj: log.port_mj[1],
             events,
             events_not_kept: log.count - kept as u64,
             path_mm: log.path_mm[..(log.path_nodes as usize).min(log.path_mm.len())].to_vec(),
+            trace: trace.map(Trace::report).unwrap_or_default(),
         })
     }
 }

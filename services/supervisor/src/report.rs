@@ -31,8 +31,8 @@
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
-//! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (last) and `closest_to_target_mm` in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` of a tick's rod, `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
 //! | `governor` | with `accuracy = "auto"`: `fronts` where they come from, `ladder` what could be given up, in order, `turns` (time, knob, value, loop, whether accuracy was given up, load), `given_up` what stood so at the end |
+//! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (at the end; null when the needle is out, `withdrawn`), `closest_to_target_mm` and `deepest_to_target_mm` (where the path was deepest) in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` and `residual_mm` of the rod in all `ticks_inside`, `ticks_slowed` and `ticks_unconverged` of them, `faults`, `port_energy_mj` and `port_energy_least_mj` (what the hand put in, less what it got back), `trace` (forces over time, see `trace.rs`; plotted beside the report), `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
 use crate::{governor::GovernorReport, memory::MIB, needle::NeedleReport, watch::Post};
@@ -58,7 +58,7 @@ pub struct Durations {
 }
 
 impl Durations {
-    fn of(histogram: &SharedHistogram, unit_ns: f64) -> Self {
+    pub(crate) fn of(histogram: &SharedHistogram, unit_ns: f64) -> Self {
         let Percentiles { p50, p99, p999, max, .. } = histogram.percentiles();
         Self { p50: p50 / unit_ns, p99: p99 / unit_ns, p999: p999 / unit_ns, max: max / unit_ns }
     }
@@ -375,16 +375,29 @@ impl fmt::Display for RunReport {
         }
         if let Some(n) = &self.needle {
             let mm = |d: Option<f64>| d.map_or("-".into(), |d| format!("{d:.1} mm"));
+            let tip = if n.withdrawn {
+                format!("withdrawn, at the deepest {} from the target", mm(n.deepest_to_target_mm))
+            } else {
+                format!("tip to target {}", mm(n.tip_to_target_mm))
+            };
             let forbidden = if n.forbidden_touched.is_empty() { "none".into() } else { n.forbidden_touched.join(", ") };
             writeln!(
                 f,
-                "\nneedle: {:.1} s inside, {:.1} mm deep, tip to target {} (closest {}), forbidden touched: {forbidden}; at most {:.2} N, {:.0} N·mm",
+                "\nneedle: {:.1} s inside, {:.1} mm deep, {tip} (closest {}), forbidden touched: {forbidden}; at most {:.2} N, {:.0} N·mm",
                 n.inside_s,
                 n.deepest_mm,
-                mm(n.tip_to_target_mm),
                 mm(n.closest_to_target_mm),
                 n.peak_force_n,
                 n.peak_torque_n_mm
+            )?;
+            writeln!(
+                f,
+                "rod mm                   {}  {} of {} ticks slowed, {} short of the tolerance; energy of the port at least {:.2} mJ",
+                small(&n.residual_mm),
+                n.ticks_slowed,
+                n.ticks_inside,
+                n.ticks_unconverged,
+                n.port_energy_least_mj
             )?;
             for e in &n.events {
                 let phase = e.breath_phase.map_or(String::new(), |p| format!(", breath at {p:.2}"));

@@ -8,10 +8,11 @@ use crate::{
     SupervisorError,
     fronts::Fronts,
     governor::Pilot,
-    memory,
-    needle::{self, NeedleReport},
+    labels, memory,
+    needle::NeedleReport,
     patient::{Patient, Progress},
     report::{RunReport, ServiceReport, StoreReport},
+    trace::Tracer,
     watch::{Post, Watch, end_all},
 };
 use maille_breathing::Prepared;
@@ -56,6 +57,8 @@ pub struct Simulation {
     pilot: Option<Pilot>,
     started_ns: u64,
     killed: Vec<Role>,
+    /// in a scene with a needle
+    tracer: Option<Tracer>,
     ended: bool,
 }
 
@@ -86,7 +89,7 @@ impl Simulation {
         let frames = frame_pool_bytes(plan.frame_bytes);
         let regions: u64 = breath.map_or(0, |breath| breath.segments().iter().map(|(_, _, bytes)| bytes).sum());
         memory::check_space(
-            segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions + needle::labels_bytes(&scene),
+            segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions + labels::bytes(&scene, &volume.info.grid),
         )?;
 
         let domain = Files(Domain::fresh()?);
@@ -103,7 +106,7 @@ impl Simulation {
         if let Some(breath) = breath {
             breath.publish(&mut store, &domain.0)?;
         }
-        needle::publish_labels(&scene, &mut store, &domain.0)?;
+        labels::publish(&scene, &volume.info.grid, &mut store, &domain.0)?;
         let path = domain.0.directory().join(SCENE_FILE);
         fs::write(&path, scene.to_toml()).map_err(SupervisorError::io(format!("{} cannot be written", path.display())))?;
         control.view.store(&first_view(&scene, volume));
@@ -131,6 +134,7 @@ impl Simulation {
             pilot: None,
             started_ns: monotonic_ns(),
             killed: Vec::new(),
+            tracer: None,
             ended: false,
         })
     }
@@ -146,6 +150,7 @@ impl Simulation {
         self.control.set_clock(&SimulationClock { origin_ns: self.started_ns, base_ns: 0, rate_ppm: REAL_TIME_PPM });
         self.control.supervisor_heartbeat_ns.store(self.started_ns, Relaxed);
         self.control.set_run_state(RunState::Running);
+        self.tracer = self.scene.has_effect("needle").then(|| Tracer::begin(&self.domain.0)).flatten();
     }
 
     /// Keeps the run going until its end; see [`Watch::run`].
@@ -189,7 +194,7 @@ impl Simulation {
             duration_s,
             ended_by: ended_by.to_owned(),
             services,
-            needle: NeedleReport::of(&self.scene, &self.control),
+            needle: NeedleReport::of(&self.scene, &self.control, self.tracer.take().map(Tracer::end)),
             governor: self.pilot.as_ref().map(Pilot::report),
             store: StoreReport::of(
                 self.info.grid.voxel_count(),
@@ -233,6 +238,9 @@ fn resolve(scene: &mut Scene, plan: &Plan, volume: &Volume) -> Result<(), Superv
     let absolute = |path: &Path| fs::canonicalize(path).map_err(SupervisorError::io(format!("{} cannot be found", path.display())));
     if let Some(file) = &scene.volume.file {
         scene.volume.file = Some(absolute(file)?);
+    }
+    if let Some(labels) = &scene.volume.labels {
+        scene.volume.labels = Some(absolute(labels)?);
     }
     if let Some(model) = &scene.breathing.model {
         scene.breathing.model = Some(absolute(model)?);

@@ -198,7 +198,7 @@ fn prepare(scene: &mut Scene, name: &str) {
                 tool.kind = ToolKind::Incision;
             }
         }
-        "needle" => {
+        "needle" | "needle-drag" => {
             if let Some(tool) = &mut scene.tool {
                 tool.kind = ToolKind::Needle;
             }

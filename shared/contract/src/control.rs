@@ -10,7 +10,7 @@ use crate::{
     histogram::SharedHistogram,
     messages::{DeviceForce, DeviceState, Stamp, ToolCommand, ToolState, UndoCommand, ViewState},
     names::PINS_PER_ROLE,
-    needle::{NeedleLog, NeedleState},
+    needle::{NeedleDrag, NeedleLog, NeedleState},
 };
 use bytemuck::{Pod, Zeroable};
 use core::sync::atomic::{
@@ -315,6 +315,10 @@ pub struct ControlBlock {
     pub switches: LatestCell<{ words::<Switches>() }>,
     /// what the page wants taken back. Writer: console
     pub undo: LatestCell<{ words::<UndoCommand>() }>,
+    /// how it drags tissue, where the scene asks for it. Writer: haptic
+    pub needle_drag: LatestCell<{ words::<NeedleDrag>() }>,
+    /// what each tick's rod left [1e-12 mm, in place of ns], ticks inside. Writer: haptic
+    pub needle_residual: SharedHistogram,
     /// one for each [`Role`](crate::Role)
     pub services: [ServiceCell; 4],
     /// pins of the store's readers; see [`Role::pins`](crate::Role::pins)

@@ -80,6 +80,32 @@ pub struct NeedleEvent {
     pub phase: f64,
 }
 
+/// How a needle drags the tissue along its path, for the effect `needle-drag`. Writer: haptic, some fifty times a second. Reader: deformation.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct NeedleDrag {
+    /// simulation time [ns]
+    pub time_ns: u64,
+    /// places in use; 0: outside
+    pub count: u64,
+    /// half the needle's outer diameter [mm]
+    pub radius_mm: f64,
+    /// places of the path from skin to tip, reference [mm]
+    pub path_mm: [[f32; 3]; NEEDLE_NODES],
+    /// how far the tissue of each is dragged, reference [mm]
+    pub by_mm: [[f32; 3]; NEEDLE_NODES],
+}
+
+impl NeedleDrag {
+    /// The drag, if its numbers can be used.
+    pub fn checked(self) -> Option<Self> {
+        let count = self.count as usize;
+        let finite = |points: &[[f32; 3]]| points.iter().flatten().all(|v| v.is_finite() && v.abs() < 1e6);
+        (count <= NEEDLE_NODES && self.radius_mm.is_finite() && finite(&self.path_mm[..count]) && finite(&self.by_mm[..count]))
+            .then_some(self)
+    }
+}
+
 /// What a needle did in a run. Writer: haptic, a few times a second and at each event; one that was restarted goes on with it. Reader: supervisor.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
@@ -94,8 +120,15 @@ pub struct NeedleLog {
     pub peaks: [f64; 2],
     /// largest residual of a tick's solve [mm]
     pub residual_mm: f64,
-    /// the path's tip to the target's centre, in reference space: now, and least [mm]
-    pub to_target_mm: [f64; 2],
+    /// the path's tip to the target's centre, in reference space [mm]: now (no number while the needle is outside), least, and where the path was
+    /// deepest
+    pub to_target_mm: [f64; 3],
+    /// ticks inside whose rod was slowed (made anew against more drag), and that did not reach its tolerance
+    pub slowed: [u64; 2],
+    /// jumps of the hand, ticks with a full path, with the handle inside tissue, with breathing that was no number, poses that were none
+    pub faults: [u64; 5],
+    /// energy that went from the hand into the needle's side [mJ]: now, and least
+    pub port_mj: [f64; 2],
     /// largest depth of the path [mm]
     pub deepest_mm: f64,
     /// nodes in use of `path_mm`

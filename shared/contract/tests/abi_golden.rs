@@ -8,7 +8,7 @@ use maille_contract::{
     ToolMove, ToolState, UndoCommand, ViewState,
     index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
-    needle::{LabelsHeader, NeedleEvent, NeedleLog, NeedleState},
+    needle::{LabelsHeader, NeedleDrag, NeedleEvent, NeedleLog, NeedleState},
     probe::{Ping, Pong},
     segment_header::{BODY_OFFSET, SEGMENT_MAGIC, SegmentHeader},
 };
@@ -62,7 +62,9 @@ fn shared_words_keep_their_sizes_and_offsets() {
     golden!(NeedleState, 1_648, time_ns: 0, nodes: 8, path_nodes: 16, tissue: 24, radius_mm: 32, depth_mm: 40, ahead_mm: 48, parts_n: 56, torque_n_mm: 80, residual_mm: 104,
         nodes_mm: 112, path_mm: 880);
     golden!(NeedleEvent, 72, time_ns: 0, kind: 8, tissue: 16, reference_mm: 24, depth_mm: 48, force_n: 56, phase: 64);
-    golden!(NeedleLog, 4_304, count: 0, ticks_inside: 8, inside_ns: 16, peaks: 24, residual_mm: 40, to_target_mm: 48, deepest_mm: 64, path_nodes: 72, path_mm: 80, events: 848);
+    golden!(NeedleLog, 4_384, count: 0, ticks_inside: 8, inside_ns: 16, peaks: 24, residual_mm: 40, to_target_mm: 48, slowed: 72, faults: 88, port_mj: 128,
+        deepest_mm: 144, path_nodes: 152, path_mm: 160, events: 928);
+    golden!(NeedleDrag, 1_560, time_ns: 0, count: 8, radius_mm: 16, path_mm: 24, by_mm: 792);
     golden!(MotionHeader, 16, bytes: 0, storage_error_mm: 8);
     assert_eq!((offset_of!(ControlBlock, magic), align_of::<ControlBlock>()), (0, 64));
     assert_eq!(offset_of!(ControlBlock, size_bytes), 8);

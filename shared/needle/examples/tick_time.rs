@@ -1,7 +1,8 @@
 //! What a tick costs, with 15, 25, 50 and 100 nodes: needle in contact, 20 path nodes, breathing from a sampled field, a hand that moves.
 //!
 //! For judging the must-show figures on a quiet machine: prints median and p99 of each in one run, factorisations a tick, the worst residual,
-//! and a hash of the forces. Run it beside `../shared/peers/bullet_chain.py`.
+//! and a hash of the forces. With a Python that has Bullet (`-- PYTHON ../shared/peers/bullet_chain.py`) one step of Bullet's chain of as many bodies is
+//! measured before and after, in the same run; the paper needs 15 such steps a tick, and 1 200 to converge.
 
 #![allow(clippy::disallowed_macros, clippy::disallowed_methods, reason = "tests and examples print what they found and take the time")]
 
@@ -42,7 +43,22 @@ impl Breathing for Sampled<'_> {
     }
 }
 
+/// Runs a script that prints one line; `None`, and why, when it cannot.
+fn peer(arguments: &[String]) -> Option<String> {
+    let [python, script] = arguments else { return None };
+    match std::process::Command::new(python).arg(script).output() {
+        Ok(out) if out.status.success() => Some(String::from_utf8_lossy(&out.stdout).lines().last().unwrap_or_default().to_owned()),
+        Ok(out) => Some(format!("{script} failed: {}", String::from_utf8_lossy(&out.stderr).lines().last().unwrap_or_default())),
+        Err(error) => Some(format!("{python} cannot be run: {error}")),
+    }
+}
+
 fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    match peer(&arguments) {
+        Some(line) => println!("peer before: {line}"),
+        None => println!("no peer beside it: give a Python with pybullet and the script"),
+    }
     let field: Vec<[f32; 3]> = (0..SIZE * SIZE * SIZE)
         .map(|n| {
             let z = ((n / (SIZE * SIZE)) as f32 * STEP_MM as f32 - 160.0) / 120.0;
@@ -95,5 +111,8 @@ fn main() {
             factorisations as f64 / times.len() as f64,
             tool.path().nodes().len(),
         );
+    }
+    if let Some(line) = peer(&arguments) {
+        println!("peer after:  {line}");
     }
 }

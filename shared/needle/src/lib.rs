@@ -11,22 +11,26 @@
 #![forbid(unsafe_code)]
 
 pub mod breathing;
+mod config;
 mod error;
 mod events;
 pub mod gauge;
 pub mod limits;
 mod path;
+mod ports;
 pub mod rod;
 mod tick;
 pub mod tissue;
 
 pub use breathing::{AtRest, Breathing};
+pub use config::{DeviceTip, NeedleConfig};
 pub use error::NeedleError;
 pub use events::{Event, EventKind};
 pub use gauge::Gauge;
 pub use path::{Path, PathNode};
+pub use ports::{Faults, HandlePose, Inputs, Outputs};
 pub use rod::{Attachment, Grip, Rod, RodParameters, Solved};
-pub use tick::{DeviceTip, Faults, HandlePose, Inputs, NeedleConfig, NeedleTool, Outputs};
+pub use tick::NeedleTool;
 pub use tissue::{AIR, Capsule, Material, MaterialTable, Tissue};
 
 /// Vectors in patient space.

@@ -62,6 +62,9 @@ impl Scene {
         } else if let Some(file) = &scene.volume.file {
             scene.volume.file = Some(document.find_file("volume.file", file, &folder, "volume file")?);
         }
+        if let Some(labels) = &scene.volume.labels {
+            scene.volume.labels = Some(document.find_file("volume.labels", labels, &folder, "label map")?);
+        }
         let transfer = PathBuf::from(&scene.rendering.transfer);
         if !TRANSFER_PRESETS.contains(&scene.rendering.transfer.as_str()) {
             let found = document.find_file("rendering.transfer", &transfer, &folder, "transfer function")?;
@@ -353,6 +356,14 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         check_range(document, &format!("incision.voxels.{c}"), n as f64, [1.0, 64.0], "voxels", faults);
     });
     check_needle(document, scene, faults);
+    if scene.has_effect("needle-drag") && scene.has_effect("relaxation") {
+        let help = Some("leave `relaxation` out: tissue that a needle drags goes where the needle lets it go".into());
+        faults.push(document.fault("effects.relaxation", "`needle-drag` and `relaxation` both move the same tissue", "one too many", help));
+    }
+    if scene.volume.labels.is_some() && scene.volume.file.is_none() {
+        let help = Some("leave it out: a made patient brings its own labels".into());
+        faults.push(document.fault("volume.labels", "labels are named for a patient that comes from no file", "no file", help));
+    }
     if scene.deformation.sampling_order == 2 {
         let help = Some("use 1 (trilinear) or 3 (tricubic)".into());
         faults.push(document.fault("deformation.sampling_order", "there is no interpolation of order 2", "1 or 3", help));

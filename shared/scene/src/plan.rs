@@ -84,7 +84,7 @@ pub struct Plan {
 }
 
 /// Bytes of the control segment: head, pins, heartbeats, last state, histograms.
-const CONTROL_BYTES: u64 = 100 * 1024;
+const CONTROL_BYTES: u64 = 120 * 1024;
 
 /// Derives the plan of a scene on a volume of this grid.
 pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {

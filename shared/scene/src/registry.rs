@@ -306,6 +306,13 @@ pub static EFFECTS: &[Effect] = &[
         hard_cases: &["constant values", "a step", "sheets of one voxel", "odd sizes", "commits under the tip"],
         ..Effect::named("smooth-surface", "what is felt (`haptic.surface`) and seen from near is the surface of a smooth function")
     },
+    Effect {
+        processes: &[Process::Deformation],
+        channels: &[&DISPLACEMENT],
+        stages: &[stage(Process::Haptic, "drag", Per::Tick), stage(Process::Deformation, "needle-drag", Per::Step)],
+        depends_on: &["needle", "deformation"],
+        ..Effect::named("needle-drag", "a needle drags tissue along: its voxels move with shaft and tip (ChainMail)")
+    },
     Effect::later("x-ray", "a fluoroscopic view", &[]),
     Effect {
         processes: &[Process::Rendering],

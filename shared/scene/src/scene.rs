@@ -85,6 +85,9 @@ pub struct VolumeSection {
     /// volume file or DICOM directory; in the file relative to the scene file, else to the working directory
     #[serde(skip_serializing_if = "Option::is_none")]
     pub file: Option<PathBuf>,
+    /// label map on the volume's grid (NRRD, MetaImage, NIfTI): which tissue is where; see `[[needle.tissue]] labels`
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub labels: Option<PathBuf>,
     /// which patient is made when there is no file
     #[serde(skip_serializing_if = "Option::is_none")]
     pub phantom: Option<PhantomKind>,
@@ -96,7 +99,7 @@ pub struct VolumeSection {
 
 impl Default for VolumeSection {
     fn default() -> Self {
-        Self { file: None, phantom: None, size: Size::Cube(256), seed: 1 }
+        Self { file: None, labels: None, phantom: None, size: Size::Cube(256), seed: 1 }
     }
 }
 
@@ -240,6 +243,8 @@ impl Scene {
     /// frames the new box.
     pub fn replace_volume(&mut self, file: PathBuf) {
         self.volume.file = Some(file);
+        // labels of another patient would be wrong everywhere
+        self.volume.labels = None;
         self.volume.phantom = None;
         if let Some(tool) = &mut self.tool {
             tool.approach = tool.elsewhere.take().or(tool.approach.take());
@@ -256,6 +261,7 @@ impl Scene {
         let mut scene = self.clone();
         // TOML is UTF-8 and a Linux path need not be; the services read the store, never this file
         scene.volume.file = scene.volume.file.map(|f| f.to_string_lossy().into_owned().into());
+        scene.volume.labels = scene.volume.labels.map(|f| f.to_string_lossy().into_owned().into());
         toml::to_string(&scene).expect("a scene holds nothing that TOML cannot say: strings, numbers, tables")
     }
 }

@@ -1,0 +1,83 @@
+//! Energy through the handle of a needle: what the hand puts in, seen from the device's port.
+//!
+//! E = −Σ F_k·(x_{k+1} − x_k) − Σ τ_k·δθ_{k+1}, exact for what is held between ticks [Hannaford & Ryu 2002]; x and θ are the handle's, F and τ what the
+//! device was given. A balance that falls below nought by more than the tissue's own motion accounts for says that the simulation feeds the hand.
+//! Observer only: nothing is lowered. (`maille-contact`'s controller is for walls that are stiff against a light device; the needle meets the hand
+//! through a grip of some newtons a millimetre, far below what a device renders passively, and a breath that lifts the hand does real work.)
+//!
+//! Units: mm, N, N·mm, mJ = N·mm; frame: world. Motion of more than a jump is none. Cost: constant. Allocation: none.
+
+use maille_needle::{HandlePose, Q, V3};
+
+/// A move by more than this in one tick was no motion [mm].
+const MAX_JUMP_MM: f64 = 10.0;
+
+/// The balance.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct NeedlePort {
+    /// energy that went in so far [mJ]
+    pub balance_mj: f64,
+    last: Option<(V3, Q)>,
+    force: V3,
+    torque: V3,
+}
+
+impl NeedlePort {
+    /// Where the handle is now and what it is given from here on. Nobody's hand on it: no work.
+    pub fn pass(&mut self, handle: &HandlePose, held: bool, force_n: [f64; 3], torque_n_mm: [f64; 3]) {
+        let at = V3::from(handle.position_mm);
+        let [x, y, z, w] = handle.orientation_xyzw;
+        let turn = Q::from_quaternion(nalgebra::Quaternion::new(w, x, y, z));
+        let sound = held && at.iter().chain(turn.coords.iter()).all(|v| v.is_finite());
+        let now = sound.then_some((at, turn));
+        if let (Some((x, q)), Some((x_last, q_last))) = (now, self.last)
+            && (x - x_last).norm() < MAX_JUMP_MM
+        {
+            let turned = (q * q_last.inverse()).scaled_axis();
+            self.balance_mj -= self.force.dot(&(x - x_last)) + self.torque.dot(&turned);
+        }
+        (self.last, self.force, self.torque) = (now, V3::from(force_n), V3::from(torque_n_mm));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn work_against_a_spring_comes_back_and_friction_does_not() {
+        let run = |force: &dyn Fn(f64, f64) -> f64| {
+            let mut port = NeedlePort::default();
+            let mut most: f64 = 0.0;
+            for n in 0..=2000 {
+                let (z, v) = ((f64::from(n) * std::f64::consts::PI / 1000.0).sin(), (f64::from(n) * std::f64::consts::PI / 1000.0).cos());
+                let handle = HandlePose { position_mm: [0.0, 0.0, z], orientation_xyzw: [0.0, 0.0, 0.0, 1.0] };
+                port.pass(&handle, true, [0.0, 0.0, force(z, v)], [0.0; 3]);
+                most = most.max(port.balance_mj);
+            }
+            (most, port.balance_mj)
+        };
+        let (most, end) = run(&|z, _| -2.0 * z);
+        // ½k z², and what holding the force for a tick gives back too much: k·Σ(δz)²/2, of 2000 steps
+        assert!((most - 1.0).abs() < 0.01 && end.abs() < 0.02, "{most} {end}");
+        let (_, end) = run(&|_, v| -0.3 * v.signum());
+        assert!((end - 0.3 * 4.0).abs() < 0.01, "{end}");
+    }
+
+    #[test]
+    fn a_jump_is_no_motion_and_a_needle_let_go_does_no_work() {
+        let at = |z: f64| HandlePose { position_mm: [0.0, 0.0, z], orientation_xyzw: [0.0, 0.0, 0.0, 1.0] };
+        let mut port = NeedlePort::default();
+        port.pass(&at(0.0), true, [0.0, 0.0, 3.0], [0.0; 3]);
+        port.pass(&at(50.0), true, [0.0, 0.0, 3.0], [0.0; 3]);
+        port.pass(&at(51.0), false, [0.0, 0.0, 3.0], [0.0; 3]);
+        port.pass(&at(f64::NAN), true, [0.0, 0.0, 3.0], [0.0; 3]);
+        port.pass(&at(52.0), true, [0.0; 3], [0.0; 3]);
+        assert_eq!(port.balance_mj, 0.0);
+        port.pass(&at(52.0), true, [0.0; 3], [0.0, 0.0, 5.0]);
+        let turned = Q::from_scaled_axis(V3::z() * 0.1);
+        let handle = HandlePose { orientation_xyzw: turned.coords.into(), ..at(52.0) };
+        port.pass(&handle, true, [0.0; 3], [0.0; 3]);
+        assert!((port.balance_mj + 0.5).abs() < 1e-12);
+    }
+}

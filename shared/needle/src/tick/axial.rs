@@ -1,0 +1,89 @@
+//! Along the needle: friction (eq. 6 and 7), the tip's spring, relaxation, and the balance of a needle that nobody holds.
+
+use super::NeedleTool;
+use crate::AIR;
+
+/// Cutting over this length makes relaxed tissue fresh [mm].
+const FRESH_MM: f64 = 1.0;
+/// Time in which a needle that was let go comes to its balance [s].
+const SETTLE_S: f64 = 0.02;
+
+impl NeedleTool {
+    /// Energy stored in needle, grip and tissue's springs [N·mm]; loads along the needle are no part of it.
+    pub fn stored_n_mm(&self) -> f64 {
+        let mut energy = self.rod.elastic_n_mm();
+        let nodes = self.path.nodes();
+        if let Some(tip) = nodes.last() {
+            let m = self.table.get(tip.material);
+            let d = (self.ahead_mm - self.path.preload_mm()).max(0.0);
+            energy += (m.a2_n_per_mm2 / 3.0 * d + 0.5 * m.a1_n_per_mm) * d * d;
+        }
+        for (i, node) in nodes.iter().enumerate().skip(1) {
+            energy += 0.5 * self.friction_stiffness(i) * node.slip_mm * node.slip_mm;
+        }
+        energy
+    }
+
+    /// Eq. 6: the shaft moves past each node by what the hand moved less what the node itself moved along the needle.
+    pub(super) fn rub(&mut self, forward: f64) {
+        let mut now = 0.0;
+        for i in 0..self.path.nodes().len() {
+            if i > 0 {
+                now += (self.world[i] - self.world[i - 1]).norm();
+            }
+            let moved = self.arc.get(i).map_or(0.0, |before| now - before);
+            let material = *self.table.get(self.path.nodes()[i].material);
+            let most = material.friction_n / material.stiffness_n_per_mm;
+            let node = &mut self.path.nodes_mut()[i];
+            node.slip_mm = (node.slip_mm + forward - moved).clamp(-most, most);
+        }
+    }
+
+    /// k_i·‖p_i − p_{i−1}‖/Δp [N/mm] of eq. 7.
+    pub(super) fn friction_stiffness(&self, i: usize) -> f64 {
+        let nodes = self.path.nodes();
+        let piece = (nodes[i].reference - nodes[i - 1].reference).norm() / self.path.spacing_mm();
+        self.table.get(nodes[i].material).stiffness_n_per_mm * piece
+    }
+
+    /// Eq. 7 before its limit [N].
+    pub(super) fn friction_wanted(&self) -> f64 {
+        (1..self.path.nodes().len()).map(|i| self.friction_stiffness(i) * self.path.nodes()[i].slip_mm).sum()
+    }
+
+    /// What is left of forces after relaxation.
+    pub(super) fn fresh(&self) -> f64 {
+        self.path.tip().map_or(1.0, |tip| 1.0 - self.table.get(tip.material).relaxing * self.relaxed)
+    }
+
+    /// Relaxation while the tip rests, undone by cutting.
+    pub(super) fn relax(&mut self, went: f64, dt: f64) {
+        let Some(tip) = self.path.tip() else { return };
+        let rest = (1.0 - self.relaxed) * (1.0 - (-dt / self.table.get(tip.material).relaxation_s).exp());
+        self.relaxed = ((self.relaxed + rest) * (-went / FRESH_MM).exp()).clamp(0.0, 1.0);
+    }
+
+    /// A needle that nobody holds goes back until the tip's spring and friction balance; Δd then.
+    pub(super) fn settle(&mut self, dt: f64) -> f64 {
+        let tip = *self.path.tip().map_or(self.table.get(AIR), |t| self.table.get(t.material));
+        let spring = (self.ahead_mm - self.path.preload_mm()).max(0.0);
+        let force = tip.tip_force_n(spring) + self.friction_wanted();
+        let stiffness = tip.a1_n_per_mm
+            + 2.0 * tip.a2_n_per_mm2 * spring
+            + (1..self.path.nodes().len()).map(|i| self.friction_stiffness(i)).sum::<f64>();
+        let back = -force / stiffness * (dt / (dt + SETTLE_S));
+        // it neither cuts nor leaves: its tip rests in its tissue
+        let most = self.path.preload_mm() + tip.deflection_mm(self.path.threshold_n(&self.table));
+        (self.ahead_mm + back).clamp(0.0, most.max(0.0))
+    }
+
+    /// Cutting and friction [N] of this tick.
+    pub(super) fn axial(&mut self, dt: f64) -> (f64, f64) {
+        let fresh = self.fresh();
+        let cutting = self.path.tip_force_n(self.ahead_mm, &self.table) * fresh;
+        let most = self.config.friction_slew_n_per_s * dt;
+        let wanted = self.friction_wanted() * fresh;
+        self.friction_n += (wanted - self.friction_n).clamp(-most, most);
+        (cutting, self.friction_n)
+    }
+}

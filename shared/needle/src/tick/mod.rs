@@ -1,0 +1,266 @@
+//! One tick of a needle: algorithm 1 of Fortmeier et al. 2015, section 2.3, around the rod.
+//!
+//! **Order** (line numbers of algorithm 1): pose checks · proxies carried by the breathing field · device position in reference space (7; the paper
+//! prints x + u, it is x − u as in section 2.2) · direction of the tip (6, eq. 3) · path (8, eq. 4) · friction (eq. 6) · rod (13) · forces (14, eq. 5, 7, 8) ·
+//! torque (15).
+//!
+//! **Where the device's tip is.** The paper's X is the tip of a stiff needle on the handle. A needle that bends, or a handle that is turned about the
+//! hole in the skin, would then pull the tip out by l(1 − cos). So X lies along the needle that is there: what of its length is not outside,
+//! L − |b − s|, measured from the skin along the path ([`DeviceTip::AlongNeedle`]). For a straight needle both are the same;
+//! [`DeviceTip::Rigid`] is the paper's.
+//!
+//! **Forces on the handle.** Cutting (5) against the tip's direction in world; friction (7) against the shaft's; base (8): what the compliant grip
+//! holds of the rod's base across the insertion direction d_1 (the vector v − (v·d_1)d_1; the paper's print lacks the second d_1). Torque: the
+//! rotational spring between handle and needle, its part about the axis set to zero. Cutting and friction go to the hand directly, as in the paper:
+//! they do not bow the rod, so that a thin needle does not buckle under what it pushes.
+//!
+//! **Between rod and tissue**: a spring per path node at the needle's arc length there, k_j times the path it stands for, across the needle; at
+//! the tip in all directions. Outside the body the needle is free: tissue that moves tilts it about the skin (lever).
+//!
+//! **Let go** (`held = false`): nothing holds the base; the rod is carried by tissue, neither cuts nor slides at its tip, pushes itself back until
+//! friction and the tip's spring balance, and the handle is where its base is.
+//!
+//! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre.
+//!
+//! Units: mm, N, N·mm, s; frame: world, where not said otherwise. Degraded modes: a pose that is not finite or whose quaternion is none → the last
+//! one stands, counted; jumps are counted and change nothing (no force exceeds the limit); a path that is full stops the tip's nodes, not
+//! the needle. Cost: 10–20 µs with 25 nodes. Allocation: none. Not here: slew limits and fading (`maille-contact`), where tissue comes from.
+
+mod axial;
+mod drag;
+mod give;
+mod hold;
+mod skin;
+
+use crate::breathing::Sound;
+use crate::config::{DeviceTip, NeedleConfig};
+use crate::error::NeedleError;
+use crate::limits::MAX_STEP_S;
+use crate::path::{Path, Told};
+use crate::ports::{Faults, HandlePose, Inputs, Outputs};
+use crate::rod::{Rod, Solved};
+use crate::{AIR, Breathing, M3, MaterialTable, Q, Tissue, V3};
+use nalgebra::Quaternion;
+
+/// A move of the device by more than this in one tick is a jump [mm].
+const MAX_JUMP_MM: f64 = 10.0;
+
+/// A needle on a device; see the module.
+#[derive(Clone, Debug)]
+pub struct NeedleTool {
+    config: NeedleConfig,
+    table: MaterialTable,
+    rod: Rod,
+    path: Path,
+    /// w_i = p_i + u(p_i) of the path's nodes [mm], world
+    world: Vec<V3>,
+    /// arc length of the proxies from the skin at the end of the last tick [mm]
+    arc: Vec<f64>,
+    position: V3,
+    orientation: Q,
+    seen: bool,
+    /// device's tip in reference space: where the next inversion begins
+    reference: V3,
+    /// length of needle inside, as the hand has it, at the last tick [mm]
+    inserted_mm: Option<f64>,
+    /// Δd while let go [mm]
+    ahead_mm: f64,
+    /// share of the tip's memory that has relaxed, 0 … 1
+    relaxed: f64,
+    /// friction given out last [N]
+    friction_n: f64,
+    faults: Faults,
+}
+
+impl NeedleTool {
+    /// A straight needle outside the patient.
+    ///
+    /// # Errors
+    /// When a number is out of range.
+    pub fn new(config: NeedleConfig, table: MaterialTable) -> Result<Self, NeedleError> {
+        Self::with_rest(config, table, |_| [0.0; 3])
+    }
+
+    /// A needle with a rest shape; see [`Rod::with_rest`].
+    ///
+    /// # Errors
+    /// When a number is out of range.
+    pub fn with_rest(config: NeedleConfig, table: MaterialTable, curvature: impl Fn(f64) -> [f64; 3]) -> Result<Self, NeedleError> {
+        config.check()?;
+        let c = &config;
+        let path = Path::new(c.path_spacing_mm, c.rod.length_mm);
+        let room = path.capacity();
+        Ok(Self {
+            rod: Rod::with_rest(c.rod, room + 2, curvature)?,
+            path,
+            table,
+            world: Vec::with_capacity(room),
+            arc: Vec::with_capacity(room),
+            position: V3::zeros(),
+            orientation: Q::identity(),
+            seen: false,
+            reference: V3::zeros(),
+            inserted_mm: None,
+            ahead_mm: 0.0,
+            relaxed: 0.0,
+            friction_n: 0.0,
+            faults: Faults::default(),
+            config,
+        })
+    }
+
+    /// The needle's nodes from handle to tip [mm], world.
+    pub fn nodes(&self) -> &[V3] {
+        self.rod.nodes()
+    }
+
+    /// The rod.
+    pub fn rod(&self) -> &Rod {
+        &self.rod
+    }
+
+    /// The path in reference space.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What it was made with.
+    pub fn config(&self) -> &NeedleConfig {
+        &self.config
+    }
+
+    /// Materials.
+    pub fn table(&self) -> &MaterialTable {
+        &self.table
+    }
+
+    /// One tick. Allocates nothing; bounded work.
+    pub fn tick<B: Breathing + ?Sized, T: Tissue + ?Sized>(&mut self, inputs: &Inputs<'_, B, T>) -> Outputs {
+        let mut told: Told = [None; crate::limits::MAX_EVENTS];
+        let sound = Sound::new(inputs.breathing);
+        let inputs = &Inputs { dt_s: inputs.dt_s, handle: inputs.handle, held: inputs.held, breathing: &sound, tissue: inputs.tissue };
+        let dt = if inputs.dt_s.is_finite() { inputs.dt_s.clamp(1e-6, MAX_STEP_S) } else { 1e-3 };
+        let held = inputs.held || self.path.nodes().is_empty();
+        self.accept(&inputs.handle, held);
+        if self.path.nodes().is_empty() {
+            self.look_for_skin(inputs, &mut told);
+        }
+        let mut out = self.outside();
+        if !self.path.nodes().is_empty() {
+            self.inside(inputs, held, dt, &mut told, &mut out);
+        }
+        out.path_nodes = self.path.nodes().len();
+        out.handle = HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() };
+        out.events = told;
+        self.faults.invalid_breathing += u64::from(sound.wrong() > 0);
+        out.faults = self.faults;
+        out
+    }
+
+    /// Takes the device's pose, or keeps the last that could be believed.
+    fn accept(&mut self, pose: &HandlePose, held: bool) {
+        let position = V3::from(pose.position_mm);
+        let [x, y, z, w] = pose.orientation_xyzw;
+        let q = Quaternion::new(w, x, y, z);
+        let length = q.norm();
+        let valid = position.iter().all(|v| v.is_finite() && v.abs() < 1e6) && length.is_finite() && length > 1e-9;
+        if !valid {
+            self.faults.invalid_poses += 1;
+        } else if held {
+            self.faults.jumps += u64::from(self.seen && (position - self.position).norm() > MAX_JUMP_MM);
+            self.position = position;
+            self.orientation = Q::new_unchecked(q / length);
+            self.seen = true;
+        }
+    }
+
+    /// What a needle gives that nothing holds.
+    fn outside(&self) -> Outputs {
+        let nodes = self.rod.nodes();
+        Outputs {
+            force_n: [0.0; 3],
+            torque_n_mm: [0.0; 3],
+            cutting_n: 0.0,
+            friction_n: 0.0,
+            base_n: 0.0,
+            tip_mm: nodes[nodes.len() - 1].into(),
+            tip_reference_mm: self.reference.into(),
+            depth_mm: 0.0,
+            ahead_mm: 0.0,
+            path_nodes: 0,
+            material: AIR,
+            handle: HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() },
+            solved: Solved { converged: true, ..Solved::default() },
+            events: [None; crate::limits::MAX_EVENTS],
+            faults: self.faults,
+        }
+    }
+
+    fn inside<B: Breathing + ?Sized, T: Tissue + ?Sized>(
+        &mut self,
+        inputs: &Inputs<'_, B, T>,
+        held: bool,
+        dt: f64,
+        told: &mut Told,
+        out: &mut Outputs,
+    ) {
+        let length = self.config.rod.length_mm;
+        // arc lengths of the last tick, then those of this one: what tissue did along the needle
+        let skin = self.carry(inputs.breathing);
+        let axis = self.rod.tip_tangent();
+        let inserted = if held { length - (self.position - skin).norm() } else { self.arc_of_tip() + self.ahead_mm };
+        let forward = inserted - self.inserted_mm.unwrap_or(inserted);
+        self.rub(forward);
+        let tip = self.path.nodes()[self.path.nodes().len() - 1].reference;
+        // eq. 3, with the exact gradient in place of differences over 1 mm
+        let cutting_axis = self.bevelled(axis);
+        let direction = to_reference_direction(inputs.breathing, tip, cutting_axis).unwrap_or(cutting_axis);
+        let mut ahead = inserted - self.arc_of_tip();
+        if held {
+            let device = match self.config.device_tip {
+                DeviceTip::AlongNeedle => self.world[self.world.len() - 1] + axis * ahead,
+                DeviceTip::Rigid => self.position + self.orientation * V3::z() * length,
+            };
+            self.reference = inputs.breathing.to_reference(device.into(), (tip + direction * ahead).into()).into();
+            ahead = (self.reference - tip).dot(&direction);
+            let went = self.path.follow(ahead, direction, inputs.tissue, &self.table, told);
+            if self.path.nodes().is_empty() {
+                self.leave();
+                *out = self.outside();
+                return;
+            }
+            ahead = (ahead - went).max(0.0);
+            self.relax(went.abs(), dt);
+            self.faults.path_full += u64::from(self.path.nodes().len() == self.path.capacity());
+        } else {
+            self.relax(0.0, dt);
+            ahead = self.settle(dt);
+        }
+        self.ahead_mm = ahead;
+        // proxies of the nodes that are there now
+        let skin = self.carry(inputs.breathing);
+        self.store_arcs();
+        self.inserted_mm = Some(if held { length - (self.position - skin).norm() } else { self.arc_of_tip() + ahead });
+        let (cutting, friction) = self.axial(dt);
+        out.solved = self.solve(held, dt);
+        self.faults.unconverged += u64::from(!out.solved.converged);
+        if !held {
+            self.hang();
+        }
+        self.give(held, cutting, friction, out);
+        let tip = &self.path.nodes()[self.path.nodes().len() - 1];
+        out.tip_reference_mm = tip.reference.into();
+        out.material = tip.material;
+        out.depth_mm = self.path.length_mm();
+        out.ahead_mm = ahead;
+        let nodes = self.rod.nodes();
+        out.tip_mm = nodes[nodes.len() - 1].into();
+    }
+}
+
+/// R⁻¹r/‖R⁻¹r‖ with R = 1 + ∂u/∂X (eq. 3); none where tissue is folded.
+fn to_reference_direction<B: Breathing + ?Sized>(breathing: &B, at: V3, world: V3) -> Option<V3> {
+    let g = breathing.gradient(at.into());
+    let r = M3::identity() + M3::from_fn(|i, j| g[i][j]);
+    r.try_inverse().and_then(|inverse| (inverse * world).try_normalize(1e-9))
+}
