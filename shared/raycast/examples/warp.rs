@@ -7,8 +7,8 @@
 //! `NODES`: nodes of the fields along each axis (64). `FINER`: voxels of the baked volume for each of the file's, along each axis (2).
 //! Times are processor time over two threads, the best of frames taken in turns: a loaded machine disturbs ratios less than times.
 
-use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Step, Warp, WarpOptions, render, render_extra};
-use maille_volume::{BrickSource as _, BrickedVolume, Grid, Sampler, VectorField, Volume, io::read_volume};
+use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Step, Warp, WarpOptions, render, render_extra, resampled};
+use maille_volume::{BrickSource as _, BrickedVolume, Grid, VectorField, io::read_volume};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -88,24 +88,23 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
         })
         .reduce(|| 0.0, f64::max);
 
+    // the paper's way: one step of the fixed point a sample, along rays of 96 mm
+    let rays = &places[..2000];
+    let (mut along, start) = (vec![[0.0; 3]; 97], now());
+    let paper: Vec<f64> = rays
+        .iter()
+        .map(|&x| {
+            at.along(x, [0.0, 1.0, 0.0], &mut along);
+            let truth = rest([x[0], x[1] + 96.0, x[2]]);
+            (0..3).map(|c| (truth[c] - along[96][c]).powi(2)).sum::<f64>().sqrt()
+        })
+        .collect();
+    let paper_ns = (now() - start) * 2e6 / (97 * rays.len()) as f64;
+
     // baked: resampled, with room for what leaves the volume; a ray then begins where a warped one does
-    let room: [f64; 3] = std::array::from_fn(|c| (1.25 * (15.0 / grid.spacing[c] + 1.0)).ceil());
-    let mut fine = Grid::axis_aligned(
-        std::array::from_fn(|c| (grid.size[c] - 1 + 2 * room[c] as usize) * finer + 1),
-        grid.spacing.map(|s| s / finer as f64),
-    );
-    fine.direction = grid.direction;
-    fine.origin = grid.world_from_index(room.map(|r| -r));
-    let sampler = Sampler::new(source);
-    let (nx, slice) = (fine.size[0], fine.size[0] * fine.size[1]);
-    let mut voxels = vec![0i16; fine.voxel_count()];
-    voxels.par_chunks_mut(slice).enumerate().for_each(|(k, plane)| {
-        for (n, voxel) in plane.iter_mut().enumerate() {
-            let x = fine.world_from_index([(n % nx) as f64, (n / nx) as f64, k as f64]);
-            *voxel = sampler.value(rest(x)).unwrap_or(-1024.0).round() as i16;
-        }
-    });
-    let baked = BrickedVolume::from_volume(&Volume::new(fine, maille_volume::Rescale::IDENTITY, voxels));
+    let start = now();
+    let baked = resampled(source, finer, 1.25 * 16.0, rest);
+    let bake = now() - start;
     let (skip, skip_baked) = (Skip::new(source, &settings), Skip::new(&baked, &settings));
     let (mut moved, mut still, mut unwarped) =
         (Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]));
@@ -145,6 +144,11 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
         "mean difference from the picture of the volume resampled {finer} times as finely: {:.2} % of full scale; from the one at rest {:.2} %",
         difference(&moved, &still),
         difference(&moved, &unwarped)
+    );
+    println!(
+        "by one step of the fixed point a sample: off by {:.4} mm on average, {:.4} at most, of 2 000 rays after 96 samples ({paper_ns:.0} ns a sample, one at a time, the truth for comparison included); by resampling the whole volume: {bake:.0} ms before the frame",
+        paper.iter().sum::<f64>() / paper.len() as f64,
+        paper.iter().copied().fold(0.0, f64::max)
     );
     let save = std::env::var("MAILLE_SAVE").ok();
     for (name, picture) in [("warped", &moved), ("baked", &still)] {
