@@ -119,8 +119,10 @@ fn checked_inverse(u: &VectorField, path: &str, scratch: &Scratch, tolerance: f6
         let rest = std::array::from_fn(|c| world[c] + f64::from(v[c]));
         let back = at(u, rest);
         let miss = length(std::array::from_fn(|c| rest[c] + back[c] - world[c]));
-        // both in f64: what is left is the rounding of patient coordinates, and of the residual's own f32
-        assert!(miss <= tolerance * 1.000_001 && (miss - residuals[n]).abs() <= 1e-9, "node {n}: {miss} mm, it claims {}", residuals[n]);
+        // what it claims bounds the residual: that itself, here and there in f64 (then the rounding of patient coordinates is left), or in f32 with a
+        // bound on its rounding, which is a dozen units in the last place of the longest vector
+        let over = residuals[n] - miss;
+        assert!(miss <= tolerance * 1.000_001 && (-1e-9..=1e-4).contains(&over), "node {n}: {miss} mm, it claims {}", residuals[n]);
         let inside = u.grid.index_from_world(rest);
         assert!((0..3).all(|c| inside[c] > -0.01 && inside[c] < (u.grid.size[c] - 1) as f64 + 0.01), "{inside:?}");
     }

@@ -27,7 +27,7 @@ pub struct Args {
     /// largest residual |v + u(x + v)| of what is written as an inverse [mm]
     #[arg(long, value_name = "MM", default_value_t = 1e-4, allow_hyphen_values = true)]
     tolerance: f64,
-    /// write the residual of every node [mm]; -1 where there is no inverse
+    /// write the residual of every node [mm], or a bound on it; -1 where there is no inverse
     #[arg(long, value_name = "R.nrrd")]
     residual: Option<PathBuf>,
     /// write where the field folds: 1 at the lower corner of every cell whose det(1 + du/dX) is at most 0

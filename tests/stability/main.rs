@@ -12,6 +12,7 @@ mod inversion;
 mod made;
 mod needle;
 mod rendering;
+mod surface;
 
 use std::{
     collections::BTreeMap,
@@ -122,7 +123,9 @@ macro_rules! hard_cases {
 }
 
 fn all() -> impl Iterator<Item = &'static Case> {
-    [chainmail::CASES, inversion::CASES, haptics::CASES, breathing::CASES, needle::CASES, rendering::CASES].into_iter().flatten()
+    [chainmail::CASES, inversion::CASES, haptics::CASES, breathing::CASES, needle::CASES, rendering::CASES, surface::CASES]
+        .into_iter()
+        .flatten()
 }
 
 #[test]

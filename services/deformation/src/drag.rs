@@ -152,8 +152,9 @@ mod tests {
             let mut engine = Engine::new(scene, reader.info(), Untimed);
             restore(&mut engine, &writer);
             let mut drag = Drag::new(scene).unwrap();
-            let mut follow =
-                |engine: &mut Engine<Untimed>, writer: &mut Writer| drag.follow(engine, control, 1_000, &reader, writer).map(|d| d.moved_elements);
+            let mut follow = |engine: &mut Engine<Untimed>, writer: &mut Writer| {
+                drag.follow(engine, control, 1_000, &reader, writer).map(|d| d.moved_elements)
+            };
             assert_eq!(follow(&mut engine, &mut writer), None, "nobody holds a needle");
             hold(control);
             control.needle_drag.store(&bowed(3.0));

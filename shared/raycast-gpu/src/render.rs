@@ -156,6 +156,9 @@ impl Renderer {
         settings: &Settings,
         picture: &Picture,
     ) -> Result<(wgpu::SubmissionIndex, FrameReport), GpuError> {
+        if extras.zoom && matches!(settings.mode, Mode::Isosurface { .. }) && extras.warp.is_none() {
+            return Err(GpuError::Unsupported("the smooth function in near views of a surface is the CPU's".into()));
+        }
         // the scalar kernel refuses what the device can draw
         let extras = &Extras { kernel: Kernel::Fastest, ..*extras };
         let numbers = twin::frame(extras, source, skip, camera, settings, picture)?;

@@ -262,7 +262,7 @@ pub static EFFECTS: &[Effect] = &[
         stages: &[stage(Process::Deformation, "incision", Per::Step)],
         panels: &["incision"],
         depends_on: &["deformation"],
-        hard_cases: &["at the border", "in air", "the same place again", "more strokes than can be taken back", "restart half-way"],
+        hard_cases: &["at the border", "the same place again"],
         ..Effect::named("incision", "a tool (`tool.kind = \"incision\"`) takes away what lies below its tip; strokes are taken back")
     },
     Effect {

@@ -5,10 +5,14 @@ use maille_volume::Grid;
 use std::path::{Path, PathBuf};
 
 fn scenes() -> Vec<PathBuf> {
-    let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../config"));
+    scenes_of("config")
+}
+
+fn scenes_of(folder: &str) -> Vec<PathBuf> {
+    let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).join(folder);
     let mut found: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
     found.retain(|p| p.extension().is_some_and(|e| e == "toml"));
-    assert!(found.len() >= 3, "{found:?}");
+    assert!(!found.is_empty());
     found
 }
 
@@ -22,6 +26,17 @@ fn every_scene_of_the_project_loads_and_plans_what_it_calls_for_and_a_page() {
             assert!(plan.starts(process), "{}: {process:?}", path.display());
         }
         assert_eq!(plan.starts(Process::Deformation), scene.has_effect("deformation"), "{}", path.display());
+    }
+}
+
+/// What they name is not part of the project: they are read without looking for it.
+#[test]
+fn scenes_of_patients_read_and_name_a_volume_in_a_file() {
+    for path in scenes_of("config/patients") {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let scene = Scene::parse("patient", &text).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        assert!(matches!(scene.volume.source(), VolumeSource::File(_)), "{}", path.display());
+        assert_eq!(Scene::parse("written", &scene.to_toml()).unwrap(), scene, "{}", path.display());
     }
 }
 

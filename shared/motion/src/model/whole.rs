@@ -29,7 +29,7 @@ use wide::f32x4;
 pub struct FieldInverse {
     /// v [mm, LPS] on the grid of u; NaN where there is none
     pub field: VectorField,
-    /// |v + u(x + v)| [mm]; −1 where there is none
+    /// |v + u(x + v)| [mm], or what bounds it: in f32 with a bound on its rounding; −1 where there is none
     pub residual_mm: ScalarField,
     /// nodes whose rest position lies beyond the grid
     pub outside: usize,
