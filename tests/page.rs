@@ -192,7 +192,7 @@ fn the_page_lives_obeys_and_survives_a_killed_rendering() {
 
 /// A small torso that breathes; nothing touches it.
 const BREATHING: &str = "name = \"breath\"\n[volume]\nphantom = \"torso\"\nsize = [96, 72, 96]\n[breathing]\nperiod_s = 3.0\n\
-                         [rendering]\nsize = [240, 180]\ntransfer = \"skin\"\nfrom = [1.0, -0.3, 0.1]\n[effects]\nbreathing = true\nsections = true\n";
+                         [rendering]\nadapt = false\nsize = [240, 180]\ntransfer = \"skin\"\nfrom = [1.0, -0.3, 0.1]\n[effects]\nbreathing = true\nsections = true\n";
 
 #[test]
 fn the_page_holds_the_breath_leads_it_and_lets_it_go_on() {

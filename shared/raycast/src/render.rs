@@ -166,6 +166,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
         let solid = solids.as_ref().and_then(|s| s.band(n));
         let ends = solid.as_ref().map(|band| Ends { band, row: n * BAND });
         let mut lens = (extras.zoom && view.is_none()).then(|| Lens::new(&frame, source.info().grid.min_spacing())).flatten();
+        let zoomed = lens.is_some();
         let mut tile = view.as_ref().map(|view| Tile::new(view, [TILE, BAND]));
         for x0 in (0..width).step_by(TILE) {
             let columns = TILE.min(width - x0);
@@ -201,7 +202,8 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                         continue;
                     }
                     let area = Area { first, size, clear };
-                    if solid.is_some() {
+                    // pixel by pixel where something looks at each; else a packet's pixels together
+                    if solid.is_some() || zoomed {
                         packet::cast_tile(lanes, &stage, ends.as_ref(), tile.as_mut(), area, |seen| seen.each(&mut put));
                     } else {
                         packet::cast_tile(lanes, &stage, None, tile.as_mut(), area, |seen| {

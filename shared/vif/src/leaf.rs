@@ -155,8 +155,9 @@ pub(crate) fn encode_raw(block: &Block, range: [i16; 2], bound: f64, out: &mut V
                 filled -= 32;
             }
         }
-        // a whole word more, so that any voxel is found by one load
+        // what is left, and two bytes more: a voxel is read from three, wherever it begins
         out.extend_from_slice(&(word as u32).to_le_bytes());
+        out.extend_from_slice(&[0; 2]);
         return (Kind::Packed, error);
     }
     out.extend(block.values().flat_map(i16::to_le_bytes));
@@ -178,7 +179,7 @@ pub(crate) fn raw_voxel(kind: Kind, bytes: &[u8], n: usize) -> f32 {
     let step = f32::from_le_bytes([bytes[2], bytes[3], bytes[4], bytes[5]]);
     let bits = usize::from(bytes[6]);
     let (at, shift) = (7 + n * bits / 8, n * bits % 8);
-    // bits ≤ 12, so that three bytes hold any; the spare word keeps the load inside
+    // bits ≤ 12, so that three bytes hold any; the spare bytes keep the load inside
     let word = u32::from(bytes[at]) | u32::from(bytes[at + 1]) << 8 | u32::from(bytes[at + 2]) << 16;
     unpack(low, step, word >> shift & ((1 << bits) - 1))
 }
