@@ -1,8 +1,10 @@
 //! What a scene does not call for costs nothing, and is not there.
 //!
 //! *Instructions*: valgrind's callgrind counts what `maille turns` does in ticks, steps and frames, once with an effect registered but not asked for
-//! and once with it taken out of the registry. Both must be the same within 0.1 %, beside what four runs of the very same differ by (memory lies elsewhere in
-//! each; printed); and an effect that is asked for must show, or the count would prove nothing. Without valgrind the tests skip, loudly; with CI set they fail.
+//! and once with it taken out of the registry. Both must be the same within 0.1 %; and an effect that is asked for must show, or the count would prove
+//! nothing. Counted is the program itself: how many instructions the C library takes to copy, to clear and to find memory depends on the addresses, which
+//! differ from run to run (by up to 0.2 % of a step), while the program's own are the same to the last one. Without valgrind the tests skip, loudly;
+//! with CI set they fail.
 //!
 //! *Processes and memory*: a scene of a volume with sections runs as one process, which maps no displacement and reaches no code of haptics,
 //! deformation or breathing.
@@ -25,8 +27,8 @@ use std::{
 };
 use support::{Run, Scratch, eventually, left_over, report, signal};
 
-/// Largest difference of instructions that counts as none.
-const NOTHING: f64 = 1e-3;
+/// Largest difference of instructions that counts as none: a hundredth of what is promised, for seen is none at all.
+const NOTHING: f64 = 1e-5;
 
 const VOLUME: &str = "[volume]\nphantom = \"torso\"\nsize = 48\n[console]\nenabled = false\n\
                       [rendering]\nsize = [48, 36]\nsection_size = [32, 24]\nadapt = false\nthreads = 1\n";
@@ -79,7 +81,7 @@ impl Counted {
 fn count(scratch: &Scratch, arguments: &[&str], scenes: &[&Path]) -> Vec<Counted> {
     let out = scratch.file("callgrind");
     let run = Command::new("valgrind")
-        .args(["--tool=callgrind", "--dump-before=*turns_mark*", "-q"])
+        .args(["--tool=callgrind", "--dump-before=*turns_mark*", "--compress-strings=no", "-q"])
         .arg(format!("--callgrind-out-file={}", out.display()))
         .arg(env!("CARGO_BIN_EXE_maille"))
         .arg("turns")
@@ -95,17 +97,31 @@ fn count(scratch: &Scratch, arguments: &[&str], scenes: &[&Path]) -> Vec<Counted
             // the n-th mark begins a stretch, which the dump at the next one holds
             let file = PathBuf::from(format!("{}.{}", out.display(), place.parse::<usize>().ok()? + 1));
             let text = fs::read_to_string(&file).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
-            let total = text.lines().find_map(|l| l.strip_prefix("totals:").or(l.strip_prefix("summary:")))?;
             Some(Counted {
                 scene: Path::new(scene).file_stem()?.to_str()?.to_owned(),
                 left_out: left_out.to_owned(),
                 kind: kind.to_owned(),
                 turns: turns.parse().ok()?,
-                instructions: total.split_whitespace().next()?.parse().ok()?,
+                instructions: own_instructions(&text) as f64,
                 file,
             })
         })
         .collect()
+}
+
+/// Instructions of the program's own functions in one of callgrind's files: lines of costs below a function of that object, but those of calls.
+fn own_instructions(text: &str) -> u64 {
+    let (mut own, mut called, mut sum) = (false, false, 0);
+    for line in text.lines() {
+        if let Some(object) = line.strip_prefix("ob=") {
+            own = Path::new(object).file_name() == Path::new(env!("CARGO_BIN_EXE_maille")).file_name();
+        } else if line.starts_with("calls=") {
+            called = true;
+        } else if line.starts_with(|c: char| c.is_ascii_digit() || "+-*".contains(c)) && !std::mem::take(&mut called) && own {
+            sum += line.rsplit(' ').next().and_then(|cost| cost.parse::<u64>().ok()).expect("a line of costs");
+        }
+    }
+    sum
 }
 
 #[test]
@@ -125,14 +141,13 @@ fn an_effect_that_is_registered_and_not_asked_for_costs_no_instruction() {
         *seen = seen.max((registered[&key].instructions / c.instructions - 1.0).abs());
     }
     println!("spread of the very same: {spread:?}");
-    assert!(spread.values().all(|s| *s < 3.0 * NOTHING), "what is the same does not take the same: {spread:?}");
+    assert!(spread.values().all(|s| *s <= NOTHING), "what is the same does not take the same: {spread:?}");
     let mut worst: BTreeMap<&str, [f64; 3]> = BTreeMap::new();
     for c in counted.iter().filter(|c| !["-", "="].contains(&c.left_out.as_str())) {
         let with = registered[&(c.scene.as_str(), c.kind.as_str())];
         assert_eq!(with.turns, c.turns, "{} {}: not the same turns", c.scene, c.kind);
         assert!(c.turns > 0.0 && c.instructions > 1e4, "{} {}: nothing was done", c.scene, c.kind);
-        let same = spread[&(c.scene.as_str(), c.kind.as_str())];
-        let difference = ((with.instructions / c.instructions - 1.0).abs() - same).max(0.0);
+        let difference = (with.instructions / c.instructions - 1.0).abs();
         let place = ["tick", "step", "frame"].iter().position(|k| *k == c.kind).expect("a kind of turn");
         let seen = &mut worst.entry(c.left_out.as_str()).or_default()[place];
         *seen = seen.max(difference);
@@ -156,7 +171,7 @@ fn an_effect_that_is_registered_and_not_asked_for_costs_no_instruction() {
         let more = registered[&("more", kind)].per_turn();
         let without = registered[&("soft", kind)].per_turn();
         println!("{kind}: {:+.1} % with {effect}", 100.0 * (more / without - 1.0));
-        assert!((more / without - 1.0).abs() > 10.0 * NOTHING, "{effect} was asked for and is not seen in a {kind}");
+        assert!((more / without - 1.0).abs() > 100.0 * NOTHING, "{effect} was asked for and is not seen in a {kind}");
     }
 }
 
