@@ -29,7 +29,8 @@ pub struct Args {
     /// Write the run's numbers as JSON when it ends
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// What moves the tool: path, path:FILE (way points), sim (a simulated hand), console (the page)
+    /// What moves the tool: path, path:FILE (way points), sim (a simulated hand), console (the page), external (another
+    /// program), inverse3, touch, forcedimension
     #[arg(long, value_name = "DEVICE", value_parser = device)]
     device: Option<Device>,
     /// Time each stage of the services' loops, for the report

@@ -29,6 +29,8 @@ use nalgebra::{Quaternion, UnitQuaternion};
 
 /// Time constant of the velocity estimate [s].
 const VELOCITY_S: f64 = 0.005;
+/// No hand is faster [mm/s]: what a device says of its velocity beyond this is not taken, and positions alone count.
+const FASTEST_MM_S: f64 = 10_000.0;
 /// Energy beyond the elastic one that the passivity controller counts as stored [mJ].
 const RESERVE_MJ: f64 = 2.0;
 /// What stays the same from tick to tick.
@@ -400,7 +402,7 @@ impl HapticCore {
             self.faults.jumps += 1;
             self.velocity = V3::zeros();
             self.passivity.forget_motion();
-        } else if let Some(velocity) = pose.velocity_mm_s.and_then(finite) {
+        } else if let Some(velocity) = pose.velocity_mm_s.and_then(finite).filter(|v| v.amax() <= FASTEST_MM_S) {
             self.velocity = velocity;
         } else if dt > 0.0 {
             self.velocity += (moved / dt - self.velocity) * (dt / (dt + VELOCITY_S));

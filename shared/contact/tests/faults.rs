@@ -71,6 +71,15 @@ fn poses_that_are_no_numbers_fade_the_force_and_it_recovers() {
     assert!(disturbed(|_| DevicePose::INVALID).invalid_poses >= 300);
 }
 
+/// The tick's own estimate takes its place: what a device says once must not stay in what comes after.
+#[test]
+fn velocities_that_no_hand_has_are_not_taken() {
+    for absurd in [1.7e308, 1e30, 1e5, f64::NAN] {
+        let faults = disturbed(|_| DevicePose { velocity_mm_s: Some([0.0, absurd, absurd]), ..pose(V3::new(0.0, 0.0, 12.0)) });
+        assert_eq!(faults.invalid_poses, 0, "the position is good: {absurd}");
+    }
+}
+
 #[test]
 fn jumps_of_100_mm_are_bounded_and_recover() {
     assert!(disturbed(|n| pose(V3::new(0.0, 0.0, if n % 2 == 0 { 112.0 } else { 12.0 }))).jumps >= 299);

@@ -50,7 +50,8 @@ impl Driver for ForceDimension {
         Ok(())
     }
 
-    fn exchange(&mut self, command: &Command) -> Result<Report, DeviceError> {
+    fn exchange(&mut self, command: &dyn Fn() -> Command) -> Result<Report, DeviceError> {
+        let command = &command();
         let lost = |reason| DeviceError::Lost { device: "the Force Dimension device", reason };
         let Some(id) = self.id else { return Err(lost("it is not open".into())) };
         // a period that was missed is not caught up

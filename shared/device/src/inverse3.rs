@@ -121,7 +121,7 @@ impl Driver for Inverse3 {
         Ok(())
     }
 
-    fn exchange(&mut self, command: &Command) -> Result<Report, DeviceError> {
+    fn exchange(&mut self, command: &dyn Fn() -> Command) -> Result<Report, DeviceError> {
         let mut socket = self.socket.take().ok_or_else(|| lost("there is no connection"))?;
         let text = loop {
             match socket.read().map_err(lost)? {
@@ -132,7 +132,7 @@ impl Driver for Inverse3 {
         };
         let state: Value = serde_json::from_str(&text).map_err(lost)?;
         let report = self.take(&state);
-        socket.send(Message::text(self.answer(command.force_n).to_string())).map_err(lost)?;
+        socket.send(Message::text(self.answer(command().force_n).to_string())).map_err(lost)?;
         self.socket = Some(socket);
         report.ok_or_else(|| lost("the service knows no such device"))
     }

@@ -69,11 +69,12 @@ pub trait Driver: Send + 'static {
     /// # Errors
     /// When it is not there.
     fn open(&mut self) -> Result<(), DeviceError>;
-    /// One exchange: gives the command, waits for the next report (a millisecond, as long as the device takes).
+    /// One exchange: gives the command, waits for the next report (a millisecond, as long as the device takes). The command is asked for when it
+    /// goes out: one that was taken before a wait may be stale after it.
     ///
     /// # Errors
     /// When the device has gone.
-    fn exchange(&mut self, command: &Command) -> Result<Report, DeviceError>;
+    fn exchange(&mut self, command: &dyn Fn() -> Command) -> Result<Report, DeviceError>;
     /// Lets go; also after a failed exchange.
     fn close(&mut self);
 }
@@ -225,9 +226,7 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile) {
         let began = monotonic_ns();
         let opened = Opened(&mut driver, shared);
         while !shared.stop.load(Relaxed) {
-            let now = monotonic_ns();
-            let given = shared.command.load::<Command>().map(|(command, _)| command);
-            let command = safe(given, now, began, profile);
+            let command = || safe(shared.command.load::<Command>().map(|(command, _)| command), monotonic_ns(), began, profile);
             let Ok(mut report) = opened.0.exchange(&command) else { break };
             report.taken_ns = monotonic_ns();
             if report.position_mm.iter().all(|v| v.is_finite()) {
@@ -238,7 +237,7 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile) {
         }
         if shared.stop.load(Relaxed) {
             // a device that keeps its last force must not keep this one
-            let _ = opened.0.exchange(&Command::zeroed());
+            let _ = opened.0.exchange(&Command::zeroed);
         }
         drop(opened);
         if !shared.stop.load(Relaxed) {

@@ -32,7 +32,7 @@ pub fn probe_kind(kind: Kind, options: &Options) -> Finding {
                 return finding(false, false, format!("no service at {}: {error}; {advice}", options.address));
             }
             // zero force is the answer that the service expects
-            let answered = driver.exchange(&bytemuck::Zeroable::zeroed());
+            let answered = driver.exchange(&bytemuck::Zeroable::zeroed);
             driver.close();
             match answered {
                 Ok(report) if report.ready == 1 => finding(true, true, format!("an Inverse3 is ready at {}", options.address)),

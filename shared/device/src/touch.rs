@@ -41,7 +41,8 @@ impl Driver for Touch {
         Ok(())
     }
 
-    fn exchange(&mut self, command: &Command) -> Result<Report, DeviceError> {
+    fn exchange(&mut self, command: &dyn Fn() -> Command) -> Result<Report, DeviceError> {
+        let command = &command();
         let lost = |error: u32| DeviceError::Lost { device: "the Touch", reason: format!("libHD says {error:#06x}") };
         let device = self.device.ok_or_else(|| lost(0))?;
         let mut frame = HdFrame { device, force_n: command.force_n, ..HdFrame::default() };
