@@ -99,6 +99,8 @@ fn frames<W: Stopwatch + Send>(
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
     let mut budget = FrameBudget::new(period_ns as f64 * 1e-6);
     let (mut shown, mut header) = (None, FrameHeader::default());
+    // whether the last beat drew: a loop that rests misses nothing
+    let mut drew = false;
     let has_needle = scene.has_effect("needle");
     let mut bodies = Vec::new();
     // only a scene whose accuracy is the governor's looks for what that turned
@@ -119,7 +121,8 @@ fn frames<W: Stopwatch + Send>(
             std::thread::sleep(NAP.min(Duration::from_nanos(next - now)));
             continue;
         }
-        next = if now - next > period_ns { now + period_ns } else { next + period_ns };
+        let missed = (now - next) / period_ns;
+        next = if missed > 0 { now + period_ns } else { next + period_ns };
         if !view.listen(life.control()) {
             life.cell().count(Counter::Refused, 1);
         }
@@ -149,6 +152,7 @@ fn frames<W: Stopwatch + Send>(
         let moving = every || shown != Some(seen);
         shown = Some(seen);
         let quality = if adapt { budget.next(moving) } else { moving.then_some(view.quality()) };
+        let was_drawing = std::mem::replace(&mut drew, quality.is_some());
         let Some(quality) = quality else {
             // what stands goes out again, for who has just come to look
             if sent > 0 && now - last_sent_ns >= STILL_NS {
@@ -166,9 +170,11 @@ fn frames<W: Stopwatch + Send>(
             let log = life.control().needle_log.load::<NeedleLog>().map(|(log, _)| log);
             needle::bodies(needle, log.as_ref(), to_world, &mut bodies);
         }
+        let mut warp_ns = 0;
         let drawn = pool.install(|| {
             watch.start();
             let warp = breather.as_mut().map(|breather| breather.go(time_ns));
+            warp_ns = monotonic_ns() - now;
             watch.split("warp");
             composer.draw(&snapshot, warp, &view, tool.as_ref(), held, needle.map(|_| bodies.as_slice()), &mut watch)
         });
@@ -196,6 +202,10 @@ fn frames<W: Stopwatch + Send>(
         last_sent_ns = now;
         if !life.record(now, monotonic_ns() - now, None) {
             continue;
+        }
+        life.cell().count(Counter::KnobsNs, composer.view_ns + if breather.is_some() { warp_ns } else { 0 });
+        if was_drawing {
+            life.cell().count(Counter::Overruns, missed);
         }
         let coarse = quality.scale < scene.rendering.scale || quality.step > 1.0;
         life.cell().count(Counter::Coarse, u64::from(coarse));

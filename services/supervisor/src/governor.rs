@@ -1,41 +1,30 @@
 //! `accuracy = "auto"`: the loads of the loops are seen, the governor is asked, and what it turns is told to the services.
 //!
 //! A **load** is the time of a turn of a loop over the time that there is for it: mean time of a frame (of a step) in the last look, followed
-//! with half of each new one, over [`PLANNED`] of the period at the scene's floor. Where the haptic loop misses more than [`MISSED`] of its ticks
-//! over a second, rendering counts as pressed too: it takes most of the processor, and the hand comes first. All of it is read from the cells in which
-//! services count anyway.
+//! with half of each new one, over [`loads::PLANNED`] of the period at the scene's floor. Rendering counts as pressed, too, where fewer frames than the floor
+//! came in the last second while there was something to show (others may have the processor between two frames), and where the haptic loop misses more
+//! than [`loads::MISSED`] of its ticks over a second: it takes most of the processor, and the hand comes first, until
+//! [`loads::GIVEN`] rungs have not helped. All of it is read from the cells in which services count anyway ([`loads`]).
 //!
 //! What is turned goes to a cell of the control block; services take it between two frames or two steps. Which knobs there are, and in which
 //! order they give way, is the registry's list ([`LIVE_KNOBS`]); how far, is the front's point of `draft`. Nothing of this exists in a scene with
 //! another accuracy.
 
+mod loads;
+
 use crate::fronts::Fronts;
 use bytemuck::Zeroable as _;
-use maille_contract::{
-    ControlBlock, KnobState, Role,
-    control::Counter,
-    histogram::{BUCKETS, lower},
-};
-use maille_governor::{FrontPoint, Governor, Ladder, Loop, Turn, error_at, time_at};
+use loads::{Blame, Busy, Turns};
+use maille_contract::{ControlBlock, KnobState, Role};
+use maille_governor::{FrontPoint, Governor, Ladder, Load, Loop, MARKED, PRESSED, Turn, error_at, time_at};
 use maille_scene::{
     Process, Scene,
     registry::{LIVE_KNOBS, knob},
 };
 use serde::Serialize;
-use std::collections::VecDeque;
 
 /// Time between looks [ns].
 pub const LOOK_NS: u64 = 100_000_000;
-/// Share of the period at the floor that a turn may take: the rest is for what is not counted in it.
-const PLANNED: f64 = 0.9;
-/// How much of a new look enters a load.
-const FOLLOW: f64 = 0.5;
-/// A load that has not been seen for so long is forgotten: the loop rests [ns].
-const STALE_NS: u64 = 1_000_000_000;
-/// Share of missed ticks above which the haptic loop presses others.
-const MISSED: f64 = 0.005;
-/// Looks over which ticks are counted: a second.
-const TICK_LOOKS: usize = 10;
 
 /// What the governor did once.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -52,6 +41,8 @@ pub struct TurnReport {
     pub coarser: bool,
     /// time of a turn of the loop over what there is for it: that seen going down, that expected going up
     pub load: f64,
+    /// why
+    pub because: &'static str,
 }
 
 /// What the governor did in a run.
@@ -67,52 +58,37 @@ pub struct GovernorReport {
     pub given_up: Vec<(String, f64)>,
 }
 
-/// Time that a loop of one service spends on its turns.
-struct Busy {
-    of: Loop,
-    role: Role,
-    /// time that there is for a turn [ns]
-    there_is_ns: f64,
-    counts: Vec<u64>,
-    load: Option<(f64, u64)>,
+/// Why a knob was turned.
+#[derive(Clone, Copy, PartialEq)]
+enum Why {
+    /// turns of the loop take longer than there is for them
+    Time,
+    /// fewer frames than the floor came
+    Frames,
+    /// the haptic loop missed ticks
+    Ticks,
+    /// the loop has room again
+    Room,
 }
 
-impl Busy {
-    fn new(of: Loop, role: Role, floor_hz: f64) -> Self {
-        Self { of, role, there_is_ns: PLANNED * 1e9 / floor_hz, counts: vec![0; BUCKETS], load: None }
+impl Why {
+    fn word(self) -> &'static str {
+        match self {
+            Self::Time => "time",
+            Self::Frames => "frames late",
+            Self::Ticks => "ticks missed",
+            Self::Room => "room",
+        }
     }
 
-    fn look(&mut self, control: &ControlBlock, now_ns: u64) {
-        let counts = control.service(self.role).duration.counts();
-        let (mut turns, mut spent_ns) = (0u64, 0.0);
-        for (bucket, (now, before)) in counts.iter().zip(&self.counts).enumerate() {
-            let new = now.saturating_sub(*before);
-            turns += new;
-            spent_ns += new as f64 * lower(bucket) as f64;
+    fn sentence(self, turn: &Turn) -> String {
+        let (of, share) = (word(turn.of), 100.0 * turn.load);
+        match self {
+            Self::Time => format!("{of} takes {share:.0} % of its time"),
+            Self::Frames => "fewer frames come than the scene's floor".into(),
+            Self::Ticks => format!("haptic misses ticks, and {of} takes most of the processor"),
+            Self::Room => format!("{of} will take {share:.0} % of its time"),
         }
-        self.counts = counts;
-        if turns > 0 {
-            let seen = spent_ns / turns as f64 / self.there_is_ns;
-            self.load = Some((self.load.map_or(seen, |(load, _)| load + FOLLOW * (seen - load)), now_ns));
-        }
-        self.load = self.load.filter(|(_, at)| now_ns.saturating_sub(*at) < STALE_NS);
-    }
-}
-
-/// Share of the haptic loop's ticks that were missed over the last second.
-#[derive(Default)]
-struct Ticks(VecDeque<[u64; 2]>);
-
-impl Ticks {
-    fn look(&mut self, control: &ControlBlock) -> f64 {
-        let cell = control.service(Role::Haptic);
-        let now = [cell.counter(Counter::Iterations), cell.counter(Counter::Overruns)];
-        self.0.push_back(now);
-        if self.0.len() > TICK_LOOKS {
-            self.0.pop_front();
-        }
-        let [ticks, missed] = self.0.front().map_or([0; 2], |then| [0, 1].map(|n| now[n].saturating_sub(then[n])));
-        missed as f64 / (ticks + missed).max(1) as f64
     }
 }
 
@@ -120,7 +96,11 @@ impl Ticks {
 pub struct Pilot {
     governor: Governor,
     busy: Vec<Busy>,
-    ticks: Ticks,
+    ticks: Turns,
+    blame: Blame,
+    frames: Turns,
+    /// frames that the scene asks for over those of its floor
+    spare: f64,
     state: KnobState,
     report: GovernorReport,
     began_ns: u64,
@@ -158,7 +138,19 @@ impl Pilot {
         }
         let report = GovernorReport { fronts: fronts.source.clone(), ladder: steps, ..GovernorReport::default() };
         let governor = Governor::new(ladder);
-        Self { governor, busy, ticks: Ticks::default(), state: KnobState::zeroed(), report, began_ns: 0, looked_ns: 0 }
+        let spare = (scene.rendering.rate_hz / scene.rendering.floor_hz).max(1.0);
+        Self {
+            governor,
+            busy,
+            ticks: Turns::new(Role::Haptic),
+            blame: Blame::default(),
+            frames: Turns::new(Role::Rendering),
+            spare,
+            state: KnobState::zeroed(),
+            report,
+            began_ns: 0,
+            looked_ns: 0,
+        }
     }
 
     /// Looks at the loads, at most once every [`LOOK_NS`]; tells the services what is turned, and the caller in a sentence.
@@ -173,19 +165,38 @@ impl Pilot {
         }
         self.looked_ns = now_ns;
         self.busy.iter_mut().for_each(|b| b.look(control, now_ns));
-        let missed = self.ticks.look(control);
-        let loads: Vec<(Loop, f64)> = self
+        let [ticks, frames] = [&mut self.ticks, &mut self.frames].map(|turns| turns.missed(control));
+        // the floor over the rate at which frames came
+        let behind = 1.0 / ((1.0 - frames.unwrap_or(0.0)).max(0.01) * self.spare);
+        let blamed = self.blame.stands(ticks, now_ns);
+        let why = [(behind > 1.0, Why::Frames), (blamed, Why::Ticks)].into_iter().find_map(|(counts, why)| counts.then_some(why));
+        // before a setting's own frames and ticks are counted it is neither pressed by them nor calm
+        let unknown = if ticks.is_none() || frames.is_none() { PRESSED } else { 0.0 };
+        let pressed = why.map_or(unknown, |_| behind.max(PRESSED + MARKED));
+        let loads: Vec<Load> = self
             .busy
             .iter()
-            .filter_map(|b| {
-                let load = b.load.map(|(load, _)| load)?;
-                Some((b.of, if b.of == Loop::Rendering && missed > MISSED { load.max(1.0 + missed) } else { load }))
-            })
+            .filter_map(|b| b.load(now_ns))
+            // who rests takes nothing from the hand
+            .map(|seen| if seen.of == Loop::Rendering && seen.load > 0.0 { Load { load: seen.load.max(pressed), ..seen } } else { seen })
             .collect();
         // a supervisor that stood still has seen nothing of that time
         let turn = self.governor.observe(&loads, since_ns.min(3 * LOOK_NS) as f64 * 1e-9)?;
         self.tell(control);
-        let said = Self::sentence(&turn);
+        // what a finer setting missed is not the coarser one's; what a coarser one did not miss stands until the finer one does
+        if turn.of == Loop::Rendering && turn.coarser {
+            self.ticks.forget();
+            self.frames.forget();
+        }
+        let because = match why {
+            _ if !turn.coarser => Why::Room,
+            Some(why) if turn.of == Loop::Rendering && turn.load <= pressed => why,
+            _ => Why::Time,
+        };
+        if because == Why::Ticks {
+            self.blame.gave(ticks.unwrap_or(0.0));
+        }
+        let said = format!("{} = {}{}: {}", turn.knob, turn.value, if turn.coarser { "" } else { " again" }, because.sentence(&turn));
         self.report.turns.push(TurnReport {
             time_s: now_ns.saturating_sub(self.began_ns) as f64 * 1e-9,
             knob: turn.knob,
@@ -193,16 +204,9 @@ impl Pilot {
             of: word(turn.of),
             coarser: turn.coarser,
             load: turn.load,
+            because: because.word(),
         });
         Some(said)
-    }
-
-    fn sentence(turn: &Turn) -> String {
-        let share = 100.0 * turn.load;
-        match turn.coarser {
-            true => format!("{} = {}: {} takes {share:.0} % of its time", turn.knob, turn.value, word(turn.of)),
-            false => format!("{} = {} again: {} will take {share:.0} % of its time", turn.knob, turn.value, word(turn.of)),
-        }
     }
 
     /// Writes the settings that stand into their cell.
@@ -232,12 +236,12 @@ fn word(of: Loop) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use maille_contract::ControlBlock;
+    use maille_contract::{ControlBlock, control::Counter};
 
     const LOOK: u64 = LOOK_NS;
 
     fn scene() -> Scene {
-        let text = "accuracy = \"auto\"\n[tool.approach]\nfrom = [0.5, 0.0, 0.5]\ntoward = [0.5, 0.5, 0.5]\n[rendering]\nfloor_hz = 10\n[effects]\ndeformation = true";
+        let text = "accuracy = \"auto\"\n[tool.approach]\nfrom = [0.5, 0.0, 0.5]\ntoward = [0.5, 0.5, 0.5]\n[rendering]\nrate_hz = 30\nfloor_hz = 10\n[effects]\ndeformation = true";
         Scene::parse("auto", text).unwrap()
     }
 
@@ -294,14 +298,57 @@ mod tests {
     }
 
     #[test]
-    fn a_loop_that_rests_says_nothing() {
+    fn a_haptic_loop_that_stood_still_once_presses_nobody() {
         let (mut pilot, control, mut now) = started();
-        run(&mut pilot, &control, &mut now, 0.3, frame(500.0), 0);
+        for _ in 0..20 {
+            run(&mut pilot, &control, &mut now, 0.9, frame(30.0), 0);
+            run(&mut pilot, &control, &mut now, 0.1, frame(30.0), 10);
+        }
+        assert_eq!(pilot.report().turns, []);
+    }
+
+    /// Others have the processor: rendering does not stay coarse for what it does not take.
+    #[test]
+    fn ticks_that_are_missed_whatever_is_given_up_are_not_rendering_s() {
+        let (mut pilot, control, mut now) = started();
+        run(&mut pilot, &control, &mut now, 30.0, frame(30.0), 2);
+        let given = pilot.report().turns.iter().filter(|t| t.coarser).count();
+        assert!((3..=6).contains(&given), "three rungs, and again after 20 s: {:?}", pilot.report().turns);
+        run(&mut pilot, &control, &mut now, 10.0, frame(30.0), 2);
+        assert_eq!(pilot.report().given_up, [], "{:?}", pilot.report().turns);
+    }
+
+    /// Each frame is quick, and others have the processor between two of them.
+    #[test]
+    fn frames_that_do_not_come_press_rendering_though_each_is_quick() {
+        let (mut pilot, control, mut now) = started();
+        let mut beat = |pilot: &mut Pilot, seconds: usize, missed: u64| {
+            for _ in 0..10 * seconds {
+                now += LOOK;
+                control.service(Role::Rendering).duration.record(20_000_000);
+                control.service(Role::Rendering).count(Counter::Iterations, 10 - missed);
+                control.service(Role::Rendering).count(Counter::Overruns, missed);
+                pilot.look(&control, now);
+            }
+        };
+        // the scene asks for three frames where its floor is one
+        beat(&mut pilot, 4, 6);
+        assert_eq!(pilot.report().turns, [], "0.4 of them is above the floor");
+        beat(&mut pilot, 4, 8);
+        assert!(pilot.report().turns.iter().all(|t| t.coarser) && !pilot.report().turns.is_empty(), "0.2 is not");
+    }
+
+    #[test]
+    fn a_loop_that_rests_has_all_back() {
+        let (mut pilot, control, mut now) = started();
+        run(&mut pilot, &control, &mut now, 1.0, frame(500.0), 0);
+        assert!(!pilot.report().turns.is_empty());
         for _ in 0..100 {
             now += LOOK;
             pilot.look(&control, now);
         }
-        assert!(pilot.report().turns.len() <= 3, "{:?}", pilot.report().turns);
+        let turns = pilot.report().turns;
+        assert!(turns.iter().filter(|t| t.coarser).count() <= 5 && pilot.report().given_up.is_empty(), "{turns:?}");
     }
 
     #[test]

@@ -25,6 +25,7 @@
 //! | `services.deformation.step_us` | from a tool move to its commit |
 //! | `services.deformation.tool_moves`, `deferred`, `refused`, `inversion_failures` | moves received; commits put off for want of a slot; messages that could not be used; voxels given their nearest answer |
 //! | `services.rendering.frames`, `rate_hz`, `frame_ms` | frames after warm-up; a second; time of one |
+//! | `services.rendering.missed` | periods at the scene's rate that went by without a picture, while there was something new to show |
 //! | `services.rendering.coarse_frames` | frames whose 3D view was drawn more coarsely than the scene asks for, to be in time |
 //! | `services.rendering.gpu` | in a scene with `backend = "gpu"`: `frames` all of whose pictures it drew, `failures`: pictures that the CPU drew in its place, and starts without it |
 //! | `services.rendering.warp` | in a scene that breathes: `unsettled` nodes of all frames' warps, `error_mm`, how far from its place anything in a frame may be drawn: `p50`, `p99`, `p999`, `max` |
@@ -158,6 +159,7 @@ pub struct RenderingReport {
     pub frames: u64,
     pub rate_hz: f64,
     pub frame_ms: Durations,
+    pub missed: u64,
     pub coarse_frames: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gpu: Option<GpuReport>,
@@ -292,6 +294,7 @@ fn own(role: Role, control: &ControlBlock) -> Own {
             frames: n(Counter::Iterations),
             rate_hz,
             frame_ms: Durations::of(&cell.duration, 1e6),
+            missed: n(Counter::Overruns),
             coarse_frames: n(Counter::Coarse),
             gpu: Some(GpuReport { frames: n(Counter::OnGpu), failures: n(Counter::GpuFailures) }).filter(|g| g.frames + g.failures > 0),
             warp: breathes(&control.warp, 0)

@@ -123,6 +123,8 @@ pub enum Counter {
     NoPatch = 20,
     /// loads of the smooth function's neighbourhood: the tip moved on, or tissue under it was rewritten (haptic)
     SmoothLoads = 21,
+    /// nanoseconds of `duration` in what knobs that turn live act on: the 3D view and its warp (rendering)
+    KnobsNs = 22,
 }
 
 /// Number of counters.

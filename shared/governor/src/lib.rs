@@ -1,12 +1,15 @@
 //! Which knob to turn next, so that loops hold their deadlines on the machine they run on.
 //!
 //! The [`Ladder`] is what may be given up, in its declared order: rungs, each from one setting of a knob to the next coarser one that lies on
-//! the measured front of error against time. The [`Governor`] stands somewhere on it. A loop that misses its deadline for [`PRESSED_S`]
-//! takes the first of its rungs that is left; one that would hold its deadline one rung higher, by the time that was measured for that
-//! rung, for long enough goes back up. One knob is turned at a time, and nothing is judged for [`SETTLE_S`] after a turn.
+//! the measured front of error against time. The [`Governor`] stands somewhere on it. A loop that misses its deadline takes the first of its rungs
+//! that is left; one that would hold its deadline one rung higher, by the time that was measured for that rung, goes back up. Both are asked for
+//! longer the nearer the load is to the bound: what grows is the time beyond it, weighed with the distance. One knob is turned at a time, and
+//! nothing is judged for [`SETTLE_S`] after a turn.
 //!
-//! Hysteresis: down at a load of 1, up only where the load expected there is below [`CALM`]; a rung that was climbed and had to be left again
-//! within [`REGRET_S`] doubles the wait before the next climb, up to [`LONGEST_WAIT_S`], and a wait that was not regretted halves it.
+//! Hysteresis: down at a load of 1, up only where the load expected there is below [`CALM`]. A rung that was climbed and had to be left again within
+//! [`REGRET_S`] is remembered with the load at which it was tried: while that load goes on, each next climb waits twice as long, up to
+//! [`LONGEST_WAIT_S`]. Once the load is by [`CHANGED`] of it lower, what pressed is gone, and nothing is waited for. Loads at different rungs are
+//! compared by what they would be with nothing given up.
 //!
 //! There is no knob of the haptic loop here: what a hand feels is not traded for time. Loads [share of the period] and times [s] come in,
 //! turns come out; pure, no clock. Invariants: a setting is always one of its knob's; what was given up first comes back last.
@@ -27,20 +30,53 @@ pub enum Loop {
     Rendering,
 }
 
+/// What was seen of a loop.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Load {
+    /// which
+    pub of: Loop,
+    /// time of a turn over what there is for it
+    pub load: f64,
+    /// share of that time on which no knob acts, 0 to 1
+    pub fixed: f64,
+}
+
+impl Load {
+    /// All of it is in the knobs' hands.
+    pub fn new(of: Loop, load: f64) -> Self {
+        Self { of, load, fixed: 0.0 }
+    }
+
+    /// What it would be where the knobs' part took `1 / saves` times as long.
+    fn without(self, saves: f64) -> f64 {
+        self.load * (self.fixed + (1.0 - self.fixed) / saves)
+    }
+
+    fn is_sound(&self) -> bool {
+        self.load.is_finite() && self.load >= 0.0 && (0.0..=1.0).contains(&self.fixed)
+    }
+}
+
 /// Load from which on a loop is pressed: compute takes the whole period, or the rate asked for is not delivered.
 pub const PRESSED: f64 = 1.0;
-/// How long a loop must be pressed before something is given up [s].
+/// How long a loop must be pressed before something is given up [s], at a load [`MARKED`] above [`PRESSED`].
 pub const PRESSED_S: f64 = 0.4;
+/// Distance of a load from its bound at which time counts once; nearer it counts less in proportion, farther up to [`FASTEST`] times.
+pub const MARKED: f64 = 0.2;
+/// Most that a load far beyond its bound counts.
+pub const FASTEST: f64 = 2.0;
 /// A setting is taken back where the load expected with it is below this.
 pub const CALM: f64 = 0.85;
-/// Shortest time of calm before that [s].
+/// Shortest time of calm before that [s], where the load expected lies half of [`MARKED`] below [`CALM`].
 pub const CALM_S: f64 = 0.4;
 /// After a turn nothing is judged for this time: the loads still show what was before [s].
 pub const SETTLE_S: f64 = 0.3;
 /// A climb that is followed by pressure within this time was wrong [s].
 pub const REGRET_S: f64 = 2.0;
-/// Longest time of calm that is asked for after climbs that were wrong [s].
-pub const LONGEST_WAIT_S: f64 = 20.0;
+/// Longest time of calm that is asked for after climbs that were wrong [s]; half of it passes where there is much room.
+pub const LONGEST_WAIT_S: f64 = 40.0;
+/// A load this much lower than that of a climb that was wrong is another one.
+pub const CHANGED: f64 = 0.8;
 
 /// A knob was turned.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,17 +103,39 @@ struct Watch {
     calm_s: f64,
     /// calm asked for before the next climb [s]
     wait_s: f64,
-    /// since the last climb [s], until it is known whether it was right
-    trial_s: Option<f64>,
+    /// since the last climb [s], until it is known whether it was right, and the load before it
+    trial: Option<(f64, f64)>,
+    /// load at which a climb was wrong
+    wrong_at: Option<f64>,
 }
 
 impl Watch {
     /// Time passes; a climb that stood for long enough was right.
     fn go_on(&mut self, dt_s: f64) {
-        self.trial_s = self.trial_s.map(|s| s + dt_s);
-        if self.trial_s.is_some_and(|s| s >= REGRET_S) {
-            self.trial_s = None;
+        self.trial = self.trial.map(|(s, load)| (s + dt_s, load));
+        if self.trial.is_some_and(|(s, _)| s >= REGRET_S) {
+            self.trial = None;
             self.wait_s = (0.5 * self.wait_s).max(CALM_S);
+        }
+    }
+
+    /// What a load would be with nothing given up, by the fronts.
+    fn whole(&self, load: Load, rungs: &[Rung]) -> f64 {
+        load.without(self.taken.iter().map(|&n| rungs[n].saves).product())
+    }
+
+    /// Takes in a load that was seen for `dt_s`.
+    fn see(&mut self, load: Load, dt_s: f64, rungs: &[Rung]) {
+        let weight = |beyond: f64| (beyond / MARKED).min(FASTEST) * dt_s;
+        let expected = self.taken.last().map(|&n| load.without(rungs[n].saves));
+        self.pressed_s = if load.load > PRESSED { self.pressed_s + weight(load.load - PRESSED) } else { 0.0 };
+        self.calm_s = match expected {
+            // a climb that was wrong costs less than a picture that stays coarse: half the distance counts as much
+            Some(e) if e < CALM => self.calm_s + weight(2.0 * (CALM - e)),
+            _ => 0.0,
+        };
+        if self.wrong_at.is_some_and(|wrong| self.whole(load, rungs) < CHANGED * wrong) {
+            (self.wrong_at, self.wait_s) = (None, CALM_S);
         }
     }
 }
@@ -94,7 +152,7 @@ pub struct Governor {
 impl Governor {
     /// At the top of the ladder: nothing is given up.
     pub fn new(ladder: Ladder) -> Self {
-        let watch = |of| Watch { of, taken: Vec::new(), pressed_s: 0.0, calm_s: 0.0, wait_s: CALM_S, trial_s: None };
+        let watch = |of| Watch { of, taken: Vec::new(), pressed_s: 0.0, calm_s: 0.0, wait_s: CALM_S, trial: None, wrong_at: None };
         Self { ladder, watches: [watch(Loop::Deformation), watch(Loop::Rendering)], settling_s: 0.0, turns: 0 }
     }
 
@@ -119,19 +177,15 @@ impl Governor {
     }
 
     /// Says what was seen in the last `dt_s`; at most one knob turns. Loads that are no numbers say nothing.
-    pub fn observe(&mut self, loads: &[(Loop, f64)], dt_s: f64) -> Option<Turn> {
+    pub fn observe(&mut self, loads: &[Load], dt_s: f64) -> Option<Turn> {
         let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
         self.watches.iter_mut().for_each(|w| w.go_on(dt_s));
         if self.settling_s > 0.0 {
             self.settling_s -= dt_s;
             return None;
         }
-        for &(of, load) in loads.iter().filter(|(_, load)| load.is_finite() && *load >= 0.0) {
-            let rungs = self.ladder.rungs();
-            let watch = &mut self.watches[of as usize];
-            let expected = watch.taken.last().map(|&n| load / rungs[n].saves);
-            watch.pressed_s = if load > PRESSED { watch.pressed_s + dt_s } else { 0.0 };
-            watch.calm_s = if expected.is_some_and(|e| e < CALM) { watch.calm_s + dt_s } else { 0.0 };
+        for &load in loads.iter().filter(|load| load.is_sound()) {
+            self.watches[load.of as usize].see(load, dt_s, self.ladder.rungs());
         }
         // pressure first; a loop that is out of rungs is left as it is
         let turn = self.down(loads).or_else(|| self.up(loads))?;
@@ -141,32 +195,39 @@ impl Governor {
         Some(turn)
     }
 
-    fn down(&mut self, loads: &[(Loop, f64)]) -> Option<Turn> {
+    fn down(&mut self, loads: &[Load]) -> Option<Turn> {
         let rungs = self.ladder.rungs();
         for watch in self.watches.iter_mut().filter(|w| w.pressed_s >= PRESSED_S) {
             let Some(next) = (0..rungs.len()).find(|n| rungs[*n].of == watch.of && !watch.taken.contains(n)) else { continue };
-            if watch.trial_s.take().is_some() {
+            if let Some((_, before)) = watch.trial.take() {
                 watch.wait_s = (2.0 * watch.wait_s).min(LONGEST_WAIT_S);
+                watch.wrong_at = Some(before);
             }
             watch.taken.push(next);
             let rung = &rungs[next];
-            let load = loads.iter().find(|l| l.0 == watch.of).map_or(f64::NAN, |l| l.1);
+            let load = seen(loads, watch.of).load;
             return Some(Turn { knob: rung.knob.clone(), value: rung.coarser, of: watch.of, coarser: true, load });
         }
         None
     }
 
-    fn up(&mut self, loads: &[(Loop, f64)]) -> Option<Turn> {
+    fn up(&mut self, loads: &[Load]) -> Option<Turn> {
         let rungs = self.ladder.rungs();
         for watch in self.watches.iter_mut().filter(|w| w.calm_s >= w.wait_s) {
+            let load = seen(loads, watch.of);
+            let before = watch.whole(load, rungs);
             let Some(last) = watch.taken.pop() else { continue };
-            watch.trial_s = Some(0.0);
+            watch.trial = Some((0.0, before));
             let rung = &rungs[last];
-            let load = loads.iter().find(|l| l.0 == watch.of).map_or(f64::NAN, |l| l.1 / rung.saves);
+            let load = load.without(rung.saves);
             return Some(Turn { knob: rung.knob.clone(), value: rung.finer, of: watch.of, coarser: false, load });
         }
         None
     }
+}
+
+fn seen(loads: &[Load], of: Loop) -> Load {
+    loads.iter().find(|l| l.of == of).copied().unwrap_or(Load::new(of, f64::NAN))
 }
 
 #[cfg(test)]

@@ -37,7 +37,7 @@ impl Machine {
     fn run(&mut self, seconds: f64, rendering: f64, deformation: f64) {
         for _ in 0..(seconds / DT_S) as usize {
             let loads =
-                [(Loop::Rendering, self.load(Loop::Rendering, rendering)), (Loop::Deformation, self.load(Loop::Deformation, deformation))];
+                [(Loop::Rendering, rendering), (Loop::Deformation, deformation)].map(|(of, full)| Load::new(of, self.load(of, full)));
             self.time_s += DT_S;
             if let Some(turn) = self.governor.observe(&loads, DT_S) {
                 self.turns.push((self.time_s, turn));
@@ -119,7 +119,7 @@ fn a_front_that_is_wrong_on_this_machine_makes_turns_rarer_and_rarer() {
     let mut turns = Vec::new();
     for n in 0..6000 {
         let load = if governor.given_up().count() == 0 { 1.1 } else { 0.4 };
-        if governor.observe(&[(Loop::Rendering, load)], DT_S).is_some() {
+        if governor.observe(&[Load::new(Loop::Rendering, load)], DT_S).is_some() {
             turns.push(f64::from(n) * DT_S);
         }
     }
@@ -127,10 +127,62 @@ fn a_front_that_is_wrong_on_this_machine_makes_turns_rarer_and_rarer() {
     assert!(in_time(0.0, 60.0) > 2 * in_time(540.0, 600.0) && in_time(540.0, 600.0) <= 8, "{turns:?}");
 }
 
+/// Climbs that were wrong make the next wait long, as long as it is the same that presses; once that is gone, what it taught is gone too.
+#[test]
+fn what_was_learnt_of_a_load_does_not_outlive_it() {
+    let mut machine = Machine::new();
+    // frames that cannot be had: a rung more is too much, whatever the fronts say
+    let stubborn = |governor: &Governor| if governor.given_up().count() < 2 { 1.3 } else { 0.5 };
+    let mut climbs = Vec::new();
+    for n in 0..600 {
+        machine.time_s += DT_S;
+        let load = stubborn(&machine.governor);
+        if machine.governor.observe(&[Load::new(Loop::Rendering, load)], DT_S).is_some_and(|turn| !turn.coarser) {
+            climbs.push(f64::from(n) * DT_S);
+        }
+    }
+    let gaps: Vec<f64> = climbs.windows(2).map(|w| w[1] - w[0]).collect();
+    assert!(gaps.len() >= 4 && gaps.last().is_some_and(|g| *g > 10.0), "waits grow: {climbs:?}");
+    let over_s = machine.time_s;
+    machine.run(5.0, 0.5, 0.1);
+    assert_eq!(machine.governor.given_up().count(), 0, "{:?}", machine.turns);
+    assert!(machine.turns.iter().all(|(at, turn)| at - over_s <= 5.0 && !turn.coarser));
+}
+
+/// Most of a frame is not the knobs': what it will take with a rung less is known all the same, and it comes back.
+#[test]
+fn time_on_which_no_knob_acts_keeps_no_rung() {
+    let mut governor = Governor::new(ladder());
+    let fixed = 0.5;
+    let load = |governor: &Governor, full: f64| {
+        let knobs = governor.given_up().fold(1.0 - fixed, |part, r| part * r.saves);
+        Load { of: Loop::Rendering, load: full * (fixed + knobs), fixed: fixed / (fixed + knobs) }
+    };
+    for full in [1.3, 0.8] {
+        for _ in 0..50 {
+            let seen = load(&governor, full);
+            governor.observe(&[seen], DT_S);
+        }
+        assert_eq!(governor.given_up().count() > 0, full > 1.0);
+    }
+    let worse = Load { fixed: f64::NAN, ..Load::new(Loop::Rendering, 9.0) };
+    assert!((0..50).all(|_| governor.observe(&[worse], DT_S).is_none()));
+}
+
+#[test]
+fn a_load_far_beyond_its_bound_is_answered_sooner_than_one_just_beyond() {
+    let first = |load: f64| {
+        let mut governor = Governor::new(ladder());
+        (1..100).find(|_| governor.observe(&[Load::new(Loop::Rendering, load)], DT_S).is_some()).map(|n| f64::from(n) * DT_S)
+    };
+    let [near, marked, far] = [1.04, 1.0 + MARKED, 3.0].map(|load| first(load).expect("it is pressed"));
+    assert!(near > 3.0 * marked && (marked - PRESSED_S).abs() <= DT_S && far < marked, "{near} {marked} {far}");
+}
+
 #[test]
 fn loads_that_flicker_about_one_turn_nothing() {
     let mut governor = Governor::new(ladder());
-    let turned = (0..1000).any(|n| governor.observe(&[(Loop::Rendering, if n % 3 == 0 { 0.9 } else { 1.3 })], DT_S).is_some());
+    let turned = (0..1000).any(|n| governor.observe(&[Load::new(Loop::Rendering, if n % 3 == 0 { 0.9 } else { 1.3 })], DT_S).is_some());
     assert!(!turned, "it was never pressed for long");
 }
 
@@ -139,12 +191,12 @@ fn loads_and_times_that_are_no_numbers_say_nothing() {
     let mut governor = Governor::new(ladder());
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0] {
         for _ in 0..50 {
-            assert_eq!(governor.observe(&[(Loop::Rendering, bad)], DT_S), None);
-            assert_eq!(governor.observe(&[(Loop::Rendering, 2.0)], if bad == -1.0 { bad } else { f64::NAN }), None);
+            assert_eq!(governor.observe(&[Load::new(Loop::Rendering, bad)], DT_S), None);
+            assert_eq!(governor.observe(&[Load::new(Loop::Rendering, 2.0)], if bad == -1.0 { bad } else { f64::NAN }), None);
         }
     }
     assert_eq!(governor.turns(), 0);
-    assert_eq!(Governor::new(Ladder::new()).observe(&[(Loop::Rendering, 9.0)], 10.0), None, "an empty ladder turns nothing");
+    assert_eq!(Governor::new(Ladder::new()).observe(&[Load::new(Loop::Rendering, 9.0)], 10.0), None, "an empty ladder turns nothing");
 }
 
 #[test]
@@ -157,10 +209,11 @@ fn any_sequence_of_loads_keeps_every_setting_on_its_ladder() {
     let mut governor = Governor::new(ladder());
     let mut current =
         std::collections::BTreeMap::from([("rendering.step", 1.0), ("rendering.opacity_end", 0.99), ("deformation.sampling_order", 3.0)]);
-    let mut loads = [(Loop::Rendering, 0.0), (Loop::Deformation, 0.0)];
+    let both = |rendering, deformation| [Load::new(Loop::Rendering, rendering), Load::new(Loop::Deformation, deformation)];
+    let mut loads = both(0.0, 0.0);
     for n in 0..50_000 {
         if n % 20 == 0 {
-            loads = [(Loop::Rendering, 2.5 * random()), (Loop::Deformation, 2.5 * random())];
+            loads = both(2.5 * random(), 2.5 * random());
         }
         if let Some(turn) = governor.observe(&loads, 0.5 * random()) {
             let rung = governor
