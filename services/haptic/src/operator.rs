@@ -190,15 +190,15 @@ fn delay_ticks(hand: &Hand, rate_hz: f64) -> usize {
     (hand.delay_ms * 1e-3 * rate_hz).round().max(0.0) as usize
 }
 
-/// What passivity and limits have to know of the device that a simulated hand holds: as of a device of the Touch class, but with the encoder, the delay and
-/// the mass of the scene's hand.
+/// What passivity and limits have to know of the device that a simulated hand holds: damping, encoder and delay of the simulated
+/// device, and the mass of the scene's hand.
 pub(crate) fn simulated_profile(hand: &Hand, max_force_n: f64, rate_hz: f64) -> DeviceProfile {
     DeviceProfile {
         name: "simulated",
         max_force_n,
         max_torque_n_mm: 0.0,
         max_stiffness_n_per_mm: f64::INFINITY,
-        damping_n_s_per_mm: crate::setup::DEVICE_DAMPING_N_S_PER_MM,
+        damping_n_s_per_mm: grip(hand).device_damping_n_s_per_mm,
         coulomb_n: hand.coulomb_n,
         quantum_mm: hand.encoder_mm,
         mass_kg: hand.mechanics()[2],
@@ -296,6 +296,17 @@ mod tests {
         let mut sampled = |said: DeviceState| operator.sample(now, now, None, || Some(said)).0;
         assert_eq!((sampled(said(now - 1, 50.0)).valid, sampled(said(now, 50.0)).velocity_mm_s), (true, Some([50.0, 0.0, 0.0])));
         assert!(!sampled(said(now + 3_600_000_000_000, 50.0)).valid && !sampled(said(u64::MAX, 50.0)).valid);
+    }
+
+    /// Gains are computed from the profile's damping: it is the simulated device's own.
+    #[test]
+    fn a_simulated_device_has_the_damping_that_its_profile_claims() {
+        let hand = Hand { encoder_mm: 0.05, delay_ms: 2.0, ..Hand::default() };
+        let profile = simulated_profile(&hand, 3.3, 1e3);
+        assert_eq!(profile.damping_n_s_per_mm, grip(&hand).device_damping_n_s_per_mm);
+        let (config, lowered) = maille_contact::HapticConfig::on_device(2.0, 100.0, 5e-4, 1e-3, &profile).unwrap();
+        assert!(lowered && grip(&hand).device_damping_n_s_per_mm > config.coupling.stiffness_n_per_mm() * 2.5e-3 + 5e-4);
+        assert_eq!(config.device_damping_n_s_per_mm, profile.damping_n_s_per_mm);
     }
 
     #[test]

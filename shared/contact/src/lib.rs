@@ -29,6 +29,7 @@ pub mod moving;
 mod node;
 pub mod passivity;
 pub mod proxy;
+mod rest;
 pub mod shape;
 pub mod shaper;
 pub mod surface;

@@ -42,6 +42,8 @@ const MATERIAL_S: f64 = 0.025;
 const DAMPING_DEPTH_MM: f64 = 0.5;
 /// The material is read this far below the surface [mm]: at the surface itself every tissue has the threshold's value.
 const MATERIAL_DEPTH_MM: f64 = 1.5;
+/// Largest component of a force that is believed [N]: a hundred times what devices give.
+const MAX_NODE_N: f64 = 1e3;
 /// Largest give-way that is believed [mm].
 const MAX_GIVE_WAY_MM: f64 = 60.0;
 
@@ -110,6 +112,17 @@ pub(crate) struct Node {
     /// at the last tick [N]
     last_force: V3,
     bridge: Bridge,
+    absurd: bool,
+}
+
+/// A force held to [`MAX_NODE_N`], zero where it is not finite; and whether it had to be.
+fn bounded(force: V3) -> (V3, bool) {
+    // not by the largest component: a NaN is none
+    if !force.iter().all(|c| c.is_finite()) {
+        return (V3::zeros(), true);
+    }
+    let size = force.amax();
+    if size <= MAX_NODE_N { (force, false) } else { (force * (MAX_NODE_N / size), true) }
 }
 
 impl Node {
@@ -125,6 +138,7 @@ impl Node {
             material: None,
             last_force: V3::zeros(),
             bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
+            absurd: false,
         }
     }
 
@@ -243,6 +257,9 @@ impl Node {
 
     /// Bridges a discontinuity: continues from the last force and lets the difference go within `over_s`.
     fn bridged(&mut self, force: V3, dt: f64, over_s: Option<f64>) -> V3 {
+        // what cannot be a force would live on in the bridge
+        let (force, bounded) = bounded(force);
+        self.absurd |= bounded;
         if let Some(duration_s) = over_s {
             self.bridge = Bridge { difference: self.last_force - force, left: 1.0, duration_s };
             return self.last_force;
@@ -252,6 +269,11 @@ impl Node {
         self.last_force
     }
 
+    /// Whether a force since the last call was none.
+    pub fn took_absurd(&mut self) -> bool {
+        std::mem::take(&mut self.absurd)
+    }
+
     fn end_contact(&mut self) {
         self.give_way = 0.0;
         self.bias = 0.0;
@@ -259,5 +281,28 @@ impl Node {
         self.last_point = None;
         self.material = None;
         self.friction.release();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_force_that_can_be_none_is_bounded_counted_and_gone_when_its_bridge_is() {
+        let shape = crate::shape::ToolShape::sphere(2.0);
+        for absurd in [f64::MAX, -1e300, 1e12, f64::NAN, f64::INFINITY] {
+            let mut node = Node::new(&shape.nodes()[0]);
+            for over_s in [None, Some(0.02), None] {
+                let force = node.bridged(V3::new(absurd, 1.0, 0.0), 1e-3, over_s);
+                assert!(force.amax() <= 2.0 * MAX_NODE_N, "{absurd}: {force:?}");
+                assert!(node.took_absurd() && !node.took_absurd());
+            }
+            let mut force = node.bridged(V3::new(0.0, 0.5, 0.0), 1e-3, Some(0.02));
+            for _ in 0..21 {
+                force = node.bridged(V3::new(0.0, 0.5, 0.0), 1e-3, None);
+            }
+            assert!((force - V3::new(0.0, 0.5, 0.0)).norm() < 1e-9 && !node.took_absurd(), "{absurd}: {force:?}");
+        }
     }
 }

@@ -9,7 +9,7 @@
 //! where e is known to ±Δ/2 only, and better after a step of one Δ: the border between both readings has then just been crossed, and dead
 //! reckoning goes on from there. The middle term is taken at the best guess of e, less a doubt: the least of all the largest errors, and four standard
 //! deviations plus three tenths of all the largest errors (rounding in a repeated motion may repeat). So rounding does not pass for stored
-//! energy: measured, the observer is hardly ever over the truth by more than 0.1 mJ, and never by 0.4 mJ (`tests/passivity.rs`).
+//! energy: measured, the observer is hardly ever over the truth by more than 0.05 mJ, and never by 0.1 mJ (`tests/passivity.rs`).
 //!
 //! **Controller.** The force is held for a tick, and d ticks of motion are not seen yet. What F_{n−d} … F_n may give out until t_{n+1} is
 //! foreseen with the least mass m of device and hand: the velocity (`velocity`, and half of its largest error) goes on, quickened by the
@@ -18,7 +18,8 @@
 //! device's own damping]. A force that only takes energy is not lowered, and F_n = 0 is always open. Slow leaks, of a tool that rests, are
 //! made good by Hannaford and Ryu's damper, −α v with α rising to α_max as the balance falls.
 //! Without Coulomb friction of K·Δ/2 in the device a light hand that rests on a stiff wall keeps a limit cycle alive [Abbott & Okamura 2005]; the
-//! controller then lets the wall give way rather than feed it.
+//! controller then lets the wall give way rather than feed it, unless the device's own damping is known: then a tip at rest is allowed what that
+//! damping takes, and a chatter of an encoder step (`rest`).
 //!
 //! **Reference.** What counts as stored is at most the elastic energy that the contact reports plus a reserve, so an hour of dissipation
 //! does not license minutes of buzzing [a bounded reference for the energy: Ryu et al. 2005]. Work done by tissue that moves by itself is granted
@@ -27,7 +28,11 @@
 //! Units: mm, N, s, kg. Cost: proportional to the delay in ticks, at most 31. Allocation: none. Not here: choosing gains that
 //! need no controller (`coupling`).
 
-use crate::{V3, velocity::Velocity};
+use crate::{
+    V3,
+    rest::{Balance, Rest},
+    velocity::Velocity,
+};
 
 /// Most ticks a pose can be late.
 pub const MAX_DELAY: usize = 32;
@@ -41,6 +46,8 @@ const SLACK: f64 = 0.5;
 const DOUBT: f64 = 0.3;
 /// Most work of moving tissue that may be out [mJ]: 1 N over a breath of 10 mm.
 const CREDIT_MJ: f64 = 10.0;
+/// Ticks after which a force that was lowered counts as steady.
+const LOWERED_TICKS: usize = 256;
 /// Time in which a lowered force comes back [s].
 const SHARE_S: f64 = 0.02;
 
@@ -55,12 +62,14 @@ pub struct Port {
     pub mass_kg: f64,
     /// largest acceleration that the hand adds [mm/s²]
     pub hand_mm_s2: f64,
+    /// the device's own damping [N·s/mm]; 0 where nothing is known of it: then a hand at rest is allowed nothing
+    pub damping_n_s_per_mm: f64,
 }
 
 impl Default for Port {
     /// Poses at once and exact; a light desktop device.
     fn default() -> Self {
-        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0 }
+        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0, damping_n_s_per_mm: 0.0 }
     }
 }
 
@@ -89,6 +98,9 @@ pub struct Passivity {
     doubt_mj: f64,
     /// sum of their variances [mJ²]
     doubt_squared: f64,
+    rest: Rest,
+    /// ticks since the force was lowered
+    since_lowered: usize,
 }
 
 impl Passivity {
@@ -106,6 +118,7 @@ impl Passivity {
             quantum_mm: hold(port.quantum_mm, 0.0, 1.0, 0.0),
             mass_kg: hold(port.mass_kg, 0.01, 10.0, 0.05),
             hand_mm_s2: hold(port.hand_mm_s2, 0.0, 1e6, 1e4),
+            damping_n_s_per_mm: hold(port.damping_n_s_per_mm, 0.0, 1.0, 0.0),
         };
         Self {
             port,
@@ -124,6 +137,8 @@ impl Passivity {
             credit_mj: 0.0,
             doubt_mj: 0.0,
             doubt_squared: 0.0,
+            rest: Rest::new(),
+            since_lowered: usize::MAX,
         }
     }
 
@@ -151,6 +166,7 @@ impl Passivity {
     pub fn forget_motion(&mut self) {
         self.last_position = None;
         self.velocity.reset();
+        self.rest = Rest::new();
     }
 
     /// Work [mJ] that tissue does on the hand by moving: it may be given out, on credit of [`CREDIT_MJ`] that what the hand gives back
@@ -183,6 +199,14 @@ impl Passivity {
     /// `elastic_mj`.
     pub(crate) fn control(&mut self, position: V3, wanted: V3, elastic_mj: f64, dt_s: f64) -> V3 {
         self.observe(position, dt_s);
+        self.rest.push(position);
+        if self.rest.is_still() {
+            let port = &self.port;
+            let speed_mm_s = self.velocity.estimate(port.quantum_mm, dt_s, port.hand_mm_s2).smooth.norm();
+            let (damping_n_s_per_mm, quantum_mm, certain_mj) = (port.damping_n_s_per_mm, port.quantum_mm, self.certain_mj());
+            let balance = Balance { certain_mj, elastic_mj, damping_n_s_per_mm, quantum_mm, speed_mm_s };
+            self.energy_mj += self.rest.allowed(&balance, dt_s);
+        }
         // what is beyond the reference is forgotten
         let surplus = self.certain_mj() - (elastic_mj + self.reserve_mj);
         if surplus > 0.0 {
@@ -219,6 +243,7 @@ impl Passivity {
         // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
         self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + dt_s / SHARE_S } else { 1.0 });
         self.lowered += u64::from(self.share < 1.0);
+        self.since_lowered = if self.share < 1.0 { 0 } else { self.since_lowered.saturating_add(1) };
         force * self.share
     }
 
@@ -236,14 +261,18 @@ impl Passivity {
         self.energy_mj -= force.dot(&moved);
         let quantum = self.port.quantum_mm;
         if quantum > 0.0 {
-            let smooth = self.velocity.estimate(quantum, dt_s, self.port.hand_mm_s2).smooth;
+            let largest = self.port.hand_mm_s2 + 1000.0 / self.port.mass_kg * force.norm();
+            let estimate = self.velocity.estimate(quantum, dt_s, largest);
+            // a lowered force changes abruptly, and the tip with it: then, and in motion, only the shortest windows follow
+            let quick = !self.rest.is_still() || self.since_lowered < LOWERED_TICKS;
+            let way = if quick { estimate.velocity } else { estimate.smooth } * dt_s;
             for c in 0..3 {
                 let (e, doubt) = self.rounding[c];
                 self.energy_mj += change[c] * e;
                 let doubt = change[c].abs() * doubt;
                 self.doubt_mj += doubt;
                 self.doubt_squared += doubt * doubt / 3.0;
-                self.rounding[c] = rounding(self.rounding[c], moved[c] / quantum, smooth[c] * dt_s, quantum);
+                self.rounding[c] = rounding(self.rounding[c], moved[c] / quantum, way[c], quantum);
             }
         }
     }

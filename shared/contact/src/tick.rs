@@ -65,6 +65,8 @@ pub struct HapticConfig {
     pub pose_quantum_mm: f64,
     /// least mass at the tip, device and hand [kg]; the passivity controller needs it
     pub device_mass_kg: f64,
+    /// the device's own damping [N·s/mm], 0 where it is not known; the passivity controller counts on it while a tip rests
+    pub device_damping_n_s_per_mm: f64,
     /// the balls of the tool; as made by [`HapticConfig::new`], one of `radius_mm` at the tip
     pub shape: ToolShape,
     /// the point that the device holds, in the tool's frame [mm]: torque is about it
@@ -93,6 +95,7 @@ impl HapticConfig {
             pose_delay_ticks: 0,
             pose_quantum_mm: 0.0,
             device_mass_kg: Port::default().mass_kg,
+            device_damping_n_s_per_mm: 0.0,
             shape: ToolShape::sphere(radius_mm),
             handle_mm: [0.0; 3],
             max_torque_n_mm: 0.0,
@@ -123,6 +126,7 @@ impl HapticConfig {
         config.pose_delay_ticks = if device.delay_s > 0.0 { (device.delay_s / period_s).ceil() as usize + 1 } else { 0 };
         config.pose_quantum_mm = device.quantum_mm;
         config.device_mass_kg = device.mass_kg;
+        config.device_damping_n_s_per_mm = device.damping_n_s_per_mm;
         config.max_torque_n_mm = device.max_torque_n_mm;
         // as the force: its whole range in some 30 ms
         config.max_torque_slew_n_mm_per_s = 30.0 * device.max_torque_n_mm;
@@ -165,6 +169,8 @@ pub struct Faults {
     pub pauses: u64,
     /// contacts lost inside tissue
     pub lost_contacts: u64,
+    /// forces of a contact that were none, or beyond what any device gives: held to 1 kN
+    pub absurd_forces: u64,
 }
 
 /// What a tick gives.
@@ -244,6 +250,7 @@ impl HapticCore {
             delay_ticks: config.pose_delay_ticks,
             quantum_mm: config.pose_quantum_mm,
             mass_kg: config.device_mass_kg,
+            damping_n_s_per_mm: config.device_damping_n_s_per_mm,
             ..Port::default()
         };
         let mut nodes = [Node::new(&config.shape.nodes()[0]); MAX_NODES];
@@ -496,6 +503,7 @@ impl HapticCore {
             torque += (felt.at - handle).cross(&felt.force);
             buried += usize::from(felt.buried);
             self.faults.lost_contacts += u64::from(felt.lost);
+            self.faults.absurd_forces += u64::from(node.took_absurd());
             self.elastic_mj += felt.elastic_mj;
             if self.config.passivity {
                 self.passivity.grant(felt.granted_mj);

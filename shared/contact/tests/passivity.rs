@@ -126,6 +126,24 @@ fn sixty_seconds_of_tapping_give_out_less_than_a_millijoule() {
     assert!((0.28..0.35).contains(&fastest), "taps as fast as claimed: {fastest} m/s");
 }
 
+/// The same on a device whose damping is known: what a tip at rest is allowed is nothing while it taps.
+#[test]
+fn taps_on_a_device_of_known_damping_give_out_less_than_a_millijoule() {
+    for delay in [0, 5] {
+        for (grip, omega, amplitude, middle) in
+            [(Grip::LIGHT, 18.0, 16.0, 8.0), (Grip::LIGHT, 37.0, 19.0, 4.0), (Grip::FULL, 37.0, 8.0, 5.0)]
+        {
+            for times in [1.0, 4.0] {
+                let stiffness = times * damping() / (T / 2.0 + delay as f64 * T);
+                let known = HapticConfig { device_damping_n_s_per_mm: damping(), ..config(stiffness, true, delay) };
+                let on = run(known, grip, V3::z(), 60.0, |t: f64| V3::new(0.0, 0.0, middle + amplitude * (t * omega).cos()));
+                say(format!("damping known, {delay} ms, {times} × passive, {:.2} m/s: {:.3} mJ in 60 s", on.speed, on.most_mj));
+                assert!(on.most_mj < 1.0, "{delay} ms, {times} ×: {on:?}");
+            }
+        }
+    }
+}
+
 /// The same with the limits of a device of the Touch class, whose slew limit stretches every fall of the force.
 #[test]
 fn a_slew_limit_is_no_licence_to_give_out_energy() {

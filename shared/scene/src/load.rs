@@ -312,6 +312,14 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
             let help =
                 Some("its rows are the patient's axes seen by the device: three unit vectors, each at a right angle to the others".into());
             faults.push(document.fault("device.rotation", "device.rotation is no rotation", "rows are not orthonormal", help));
+        } else if (0..3).map(|c| r[0][c] * (r[1][(c + 1) % 3] * r[2][(c + 2) % 3] - r[1][(c + 2) % 3] * r[2][(c + 1) % 3])).sum::<f64>()
+            < 0.0
+        {
+            let help = Some(
+                "turn the sign of one row: a mirrored hand would push where it wants to pull, and its turns would go the wrong way".into(),
+            );
+            let message = "device.rotation is a reflection (its determinant is −1), no rotation";
+            faults.push(document.fault("device.rotation", message, "mirrors the device", help));
         }
     }
     check_finite(document, "device.origin_mm", scene.device.origin_mm, faults);

@@ -37,6 +37,14 @@ fn an_unknown_word_is_answered_with_the_words_there_are() {
     assert!(error.to_string().contains("sigma.7") || error.to_string().contains("no profile"), "{error}");
     let error = fault("[device]\nrotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]]");
     assert!(error.to_string().contains("no rotation"), "{error}");
+    for mirrored in [
+        "[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]",
+        "[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]",
+        "[[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]",
+    ] {
+        let error = fault(&format!("[device]\nrotation = {mirrored}"));
+        assert!(error.to_string().contains("reflection"), "{error}");
+    }
 }
 
 #[test]
