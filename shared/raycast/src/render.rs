@@ -194,7 +194,11 @@ pub fn render_extra<S: BrickSource + ?Sized>(
             match lanes {
                 Some(lanes) => {
                     let (first, size) = ([x0, n * BAND], [columns, rows]);
-                    let clear = if tile.is_none() { beam::clear(&frame, skip, first, size) } else { 0.0 };
+                    let mut clear = beam::clear(&frame, skip, view.as_ref(), first, size);
+                    if view.is_some() {
+                        // so that rays which come in where the volume is cut open have a sample outside before
+                        clear -= frame.step;
+                    }
                     if clear == f32::INFINITY && solid.is_none() {
                         // nothing at all
                         let nothing = Seen { color: [0.0; 3], transmittance: 1.0, depth: f32::INFINITY };

@@ -143,6 +143,20 @@ impl<'a> Tile<'a> {
         [&p[0], &p[1], &p[across], &p[across + 1]]
     }
 
+    /// v at a pixel, as rays read it, at a distance from the eye [mm].
+    #[cfg(test)]
+    pub fn at(&mut self, pixel: [usize; 2], t: f32) -> [f32; 3] {
+        let s = ((t - self.view.first) / self.view.apart).max(0.0);
+        let slab = (s as usize).min(self.last_slab());
+        self.fill(slab);
+        let (cell, [x, y], _) = self.cell(pixel);
+        let s = s - slab as f32;
+        std::array::from_fn(|c| {
+            let v = self.corners(slab, cell).map(|[a, b, p]| a[c] + s * (b[c] + s * p[c]));
+            (1.0 - y) * ((1.0 - x) * v[0] + x * v[1]) + y * ((1.0 - x) * v[2] + x * v[3])
+        })
+    }
+
     /// ∂v/∂x [mm per mm] at a pixel at the beginning of a slab, and its change to the end: for each axis d, by component.
     #[inline(always)]
     pub fn turns(&self, slab: usize, pixel: [f32; 2]) -> [[f32x4; 3]; 2] {

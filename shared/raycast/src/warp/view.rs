@@ -39,8 +39,17 @@ pub(crate) struct View {
     pub turns: Vec<[f32x4; 3]>,
     /// largest |∂v_c/∂t| along rays [index/mm]
     pub steepest: [f32; 3],
+    /// how far v lies at most beyond what straight lines between nodes say [index]
+    bulge: [f32; 3],
     /// bound on what interpolation between nodes adds [mm]
     pub error_mm: f32,
+}
+
+/// Least and largest v by component [index].
+#[derive(Clone, Copy)]
+pub(crate) struct Hull {
+    pub low: [f32; 3],
+    pub high: [f32; 3],
 }
 
 impl View {
@@ -85,6 +94,7 @@ impl View {
             nodes: vec![f32x4::ZERO; nx * ny * nz],
             turns: Vec::new(),
             steepest: [0.0; 3],
+            bulge: [0.0; 3],
             error_mm: 0.0,
         };
         let directions = view.directions(frame);
@@ -100,7 +110,7 @@ impl View {
         let steps = [1, nx, nx * ny];
         // (errors across and along [mm], both, steepest) of a plane
         let found = (2..nz - 2).into_par_iter().map(|k| {
-            let (mut errors, mut steepest) = ([0.0f32; 3], f32x4::ZERO);
+            let (mut errors, mut steepest, mut bent) = ([0.0f32; 3], f32x4::ZERO, f32x4::ZERO);
             for (j, i) in (2..ny - 2).flat_map(|j| (2..nx - 2).map(move |i| (j, i))) {
                 let column = j * nx + i;
                 let n = k * nx * ny + column;
@@ -124,14 +134,33 @@ impl View {
                 // a parabola's slope at the ends of its slab
                 let ahead = (v(2, 1) - v(2, 0)).abs() + second[2].abs().fast_max(next.abs()) * f32x4::splat(0.5);
                 steepest = steepest.fast_max(ahead * f32x4::splat(1.0 / apart));
+                bent = bent.fast_max(second[0].abs() + second[1].abs() + second[2].abs().fast_max(next.abs()));
             }
-            (errors, steepest)
+            (errors, steepest, bent)
         });
-        let (errors, steepest) = found.reduce(|| ([0.0; 3], f32x4::ZERO), |a, b| (larger(a.0, b.0), a.1.fast_max(b.1)));
+        let none = || ([0.0; 3], f32x4::ZERO, f32x4::ZERO);
+        let (errors, steepest, bent) = found.reduce(none, |a, b| (larger(a.0, b.0), a.1.fast_max(b.1), a.2.fast_max(b.2)));
         // a fifth more, for what lies between nodes
         let [x, y, z, _] = steepest.to_array();
         (view.error_mm, view.steepest) = (errors[2], [x, y, z].map(|s| 1.2 * s));
+        // cubics and parabolas leave the line by an eighth of the second difference, cubics of cubics by a quarter more each
+        let [x, y, z, _] = bent.to_array();
+        view.bulge = [x, y, z].map(|b| 1.2 * 1.25 * 1.25 / 8.0 * b);
         (view, [errors[0], errors[1]])
+    }
+
+    /// Least and largest v of the nodes around a tile in plane k, the bulge included.
+    pub fn hull(&self, first: [usize; 2], size: [usize; 2], k: usize) -> Hull {
+        let [nx, ny, _] = self.counts;
+        let [columns, rows] = [0, 1].map(|c| first[c] / self.pitch + 1..=((first[c] + size[c] - 1) / self.pitch + 2).min(self.counts[c] - 1));
+        let (mut low, mut high) = (f32x4::splat(f32::INFINITY), f32x4::splat(f32::NEG_INFINITY));
+        for row in rows {
+            for node in &self.nodes[(k * ny + row) * nx..][columns.clone()] {
+                (low, high) = (low.fast_min(*node), high.fast_max(*node));
+            }
+        }
+        let (low, high) = (low.to_array(), high.to_array());
+        Hull { low: std::array::from_fn(|c| low[c] - self.bulge[c]), high: std::array::from_fn(|c| high[c] + self.bulge[c]) }
     }
 
     /// Unit directions of the columns, in the grid's axes.
