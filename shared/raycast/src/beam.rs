@@ -58,10 +58,11 @@ impl Faces {
     }
 }
 
-/// Distance from the eye below which no ray of a tile meets an occupied cell; infinite when none ever does.
-pub fn clear(frame: &Frame, skip: &Skip, view: Option<&View>, first: [usize; 2], size: [usize; 2]) -> f32 {
+/// Distances from the eye before and after which no ray of a tile meets an occupied cell; the first infinite when none ever does. Nothing is looked at
+/// nearer than `from`.
+pub fn span(frame: &Frame, skip: &Skip, view: Option<&View>, first: [usize; 2], size: [usize; 2], from: f32) -> [f32; 2] {
     if frame.barrel != 0.0 {
-        return 0.0;
+        return [0.0, f32::INFINITY];
     }
     let [left, top] = first.map(|v| v as f32);
     let [right, bottom] = [left + (size[0] - 1) as f32, top + (size[1] - 1) as f32];
@@ -71,12 +72,11 @@ pub fn clear(frame: &Frame, skip: &Skip, view: Option<&View>, first: [usize; 2],
         (0..3).map(|c| (corner[c] - middle[c]).powi(2)).sum::<f32>().sqrt()
     });
     let straight = Faces::straight(frame, &middle, spread.into_iter().fold(0.0, f32::max));
-    let Some((mut t, end)) = crossing(frame, &straight) else { return f32::INFINITY };
+    let nothing = [f32::INFINITY; 2];
+    let Some((enter, end)) = crossing(frame, &straight) else { return nothing };
+    let mut t = enter.max(from);
     let Some(view) = view else {
-        return match empty(frame, skip, &straight, &mut t, end) {
-            true if t >= end => f32::INFINITY,
-            _ => t,
-        };
+        return if empty(frame, skip, &straight, &mut t, end) { nothing } else { [t, end] };
     };
     // slab by slab: within one, what the warp adds goes from plane to plane in straight lines, but for its bulge
     let slabs = view.counts[2] - 3;
@@ -87,11 +87,11 @@ pub fn clear(frame: &Frame, skip: &Skip, view: Option<&View>, first: [usize; 2],
         let (from, to) = (view.first + slab as f32 * view.apart, view.first + (slab + 1) as f32 * view.apart);
         let (until, after) = (if last { end } else { to.min(end) }, view.hull(first, size, slab + 2));
         if !empty(frame, skip, &straight.bent([from, to], [begin, after]), &mut t, until) {
-            return t;
+            return [t, end];
         }
         (slab, begin, t) = ((slab + 1).min(slabs - 1), after, t.max(until));
     }
-    f32::INFINITY
+    nothing
 }
 
 /// Goes on from t for as long as the box meets empty cells alone, to `end` at most: whether it came there.
@@ -235,12 +235,17 @@ mod tests {
                 let up = if n % 2 == 0 { [0.0, 1.0, 0.2] } else { [0.1, 0.3, 1.0] };
                 let camera = Camera { eye, target: middle, up, fov_deg: 25.0 + 15.0 * n as f64 };
                 let frame = Frame::new(bricks.info(), &camera, &settings, [96, 80], 0.0, warp.map_or([0.0; 3], Warp::margin));
-                let view = warp.map(|warp| View::new(warp, &frame, [96, 80]));
-                let mut tile = view.as_ref().map(|view| Tile::new(view, [32, 16]));
+                let view = warp.map(|warp| View::new(warp, &frame, Some(&skip), [96, 80], [32, 16]));
+                // with nodes everywhere, to look where no ray of the picture looks
+                let everywhere = warp.map(|warp| View::new(warp, &frame, None, [96, 80], [32, 16]));
+                let mut whole = everywhere.as_ref().map(|view| Tile::new(view, [32, 16]));
                 for (x0, y0) in (0..96).step_by(32).flat_map(|x| (0..80).step_by(16).map(move |y| (x, y))) {
-                    let clear = clear(&frame, &skip, view.as_ref(), [x0, y0], [32, 16]);
+                    let clear = match &view {
+                        Some(view) => view.span(y0 / 16 * 3 + x0 / 32)[0],
+                        None => span(&frame, &skip, None, [x0, y0], [32, 16], 0.0)[0],
+                    };
                     empty += usize::from(clear.is_infinite());
-                    if let Some(tile) = &mut tile {
+                    if let Some(tile) = &mut whole {
                         tile.begin([x0, y0], [32, 16]);
                     }
                     for (x, y) in (x0..x0 + 32).step_by(5).flat_map(|x| (y0..y0 + 16).step_by(5).map(move |y| (x, y))) {
@@ -249,7 +254,7 @@ mod tests {
                         gained += f64::from((clear.min(ray.start + ray.length * frame.step) - first).max(0.0));
                         let mut q = 0.0;
                         while q < ray.length && ray.start + q * frame.step < clear {
-                            let v = tile.as_mut().map_or([0.0; 3], |tile| tile.at([x, y], ray.start + q * frame.step));
+                            let v = whole.as_mut().map_or([0.0; 3], |tile| tile.at([x, y], ray.start + q * frame.step));
                             let p: [f32; 3] = std::array::from_fn(|c| ray.origin[c] + q * ray.delta[c] + v[c]);
                             q += 0.11;
                             if (0..3).any(|c| p[c] < 0.0 || p[c] > frame.last[c]) {
