@@ -50,10 +50,11 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
     let coefficients = moment(t);
     let camera = Camera::around(source.info());
     let settings = Settings { step: Step::Millimetres(1.0), ..Settings::volume(Preset::Ct.transfer()) };
+    let skip = Skip::new(source, &settings);
     let (mut lattice, mut view_mm) = (f64::INFINITY, 0.0);
     for _ in 0..ROUNDS {
         let start = now();
-        view_mm = warp.view_error_mm(source.info(), &camera, &settings, SIZE, 0.0).expect("a sound camera");
+        view_mm = warp.view_error_mm(source.info(), &skip, &camera, &settings, SIZE, 0.0).expect("a sound camera");
         lattice = lattice.min(now() - start);
     }
 
@@ -105,7 +106,7 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
     let start = now();
     let baked = resampled(source, finer, 1.25 * 16.0, rest);
     let bake = now() - start;
-    let (skip, skip_baked) = (Skip::new(source, &settings), Skip::new(&baked, &settings));
+    let skip_baked = Skip::new(&baked, &settings);
     let (mut moved, mut still, mut unwarped) =
         (Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]));
     let mut times = [f64::INFINITY; 3];

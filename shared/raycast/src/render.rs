@@ -23,6 +23,8 @@ use thiserror::Error;
 const BAND: usize = 16;
 /// Columns of a tile: rays that share bricks in the first cache.
 const TILE: usize = 32;
+/// Both.
+pub(crate) const TILES: [usize; 2] = [TILE, BAND];
 
 /// Why no picture was made.
 #[derive(Debug, Error, Clone, PartialEq)]
@@ -151,7 +153,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
     let frame = Frame::new(source.info(), camera, settings, [width, height], extras.barrel as f32, margin);
     let caster = Caster { frame: &frame, source, skip, jumps: extras.kernel != Kernel::ScalarWithoutSkipping };
     let stage = Stage { frame: &frame, source, skip, labels: extras.labels };
-    let view = extras.warp.map(|w| View::new(w, &frame, [width, height]));
+    let view = extras.warp.map(|w| View::new(w, &frame, Some(skip), [width, height], TILES));
     let solids = extras.geometry.filter(|g| !g.is_empty());
     let solids = solids.map(|g| Solids::new(g, camera, settings, [width, height], extras.barrel as f32, BAND));
     let lanes = match extras.kernel {
@@ -167,7 +169,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
         let ends = solid.as_ref().map(|band| Ends { band, row: n * BAND });
         let mut lens = (extras.zoom && view.is_none()).then(|| Lens::new(&frame, source.info().grid.min_spacing())).flatten();
         let zoomed = lens.is_some();
-        let mut tile = view.as_ref().map(|view| Tile::new(view, [TILE, BAND]));
+        let mut tile = view.as_ref().map(|view| Tile::new(view, TILES));
         for x0 in (0..width).step_by(TILE) {
             let columns = TILE.min(width - x0);
             if let Some(tile) = &mut tile {
@@ -194,7 +196,11 @@ pub fn render_extra<S: BrickSource + ?Sized>(
             match lanes {
                 Some(lanes) => {
                     let (first, size) = ([x0, n * BAND], [columns, rows]);
-                    let clear = if tile.is_none() { beam::clear(&frame, skip, first, size) } else { 0.0 };
+                    let clear = match &view {
+                        // so that rays which come in where the volume is cut open have a sample outside before
+                        Some(view) => view.span(n * width.div_ceil(TILE) + x0 / TILE)[0] - frame.step,
+                        None => beam::span(&frame, skip, None, first, size, 0.0)[0],
+                    };
                     if clear == f32::INFINITY && solid.is_none() {
                         // nothing at all
                         let nothing = Seen { color: [0.0; 3], transmittance: 1.0, depth: f32::INFINITY };

@@ -342,10 +342,9 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
     /// Where samples are looked up: on the ray, or where the warp takes them.
     #[inline(always)]
     fn bent(&mut self, q: L::Float, alive: L::Mask) -> [L::Float; 3] {
-        let p = self.rays.at(q);
         match &mut self.bend {
-            Some(bend) => bend.bend(self.l, q, p, alive),
-            None => p,
+            Some(bend) => bend.bend(self.l, q, alive),
+            None => self.rays.at(q),
         }
     }
 
@@ -596,8 +595,8 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
 fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::Float; 3]) -> (L::Mask, L::Float) {
     let mut gap = l.set(0.0);
     for (c, &p) in p.iter().enumerate() {
-        let beyond = (l.set(0.0) - p).max(p - l.set(frame.last[c]));
-        gap = gap.max(beyond * bend.slowest()[c]);
+        let [forwards, backwards] = bend.slowest()[c];
+        gap = gap.max((l.set(0.0) - p) * forwards).max((p - l.set(frame.last[c])) * backwards);
     }
     (l.set(0.0).lt(gap), gap)
 }
@@ -637,7 +636,7 @@ pub fn cast<L: Lanes, S: BrickSource + ?Sized>(
     let frame = stage.frame;
     let first = stage.source.brick(0).voxels.as_ptr();
     let rays = Rays::new(l, frame, ends, x, y);
-    let bend = tile.map(|tile| Bend::new(l, frame, tile, [x, y], rays.start, rays.delta));
+    let bend = tile.map(|tile| Bend::new(l, frame, tile, [x, y], rays.start, [rays.origin, rays.delta]));
     let inverse = axes!(c => l.set(1.0) / rays.delta[c]);
     let mut walker = Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] };
     walker.walk(clear)

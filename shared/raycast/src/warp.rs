@@ -26,4 +26,4 @@ pub use field::{Moment, Motion, WarpError};
 pub use lattice::{Warp, WarpOptions, WarpReport};
 pub use reference::resampled;
 pub(crate) use tile::Tile;
-pub(crate) use view::View;
+pub(crate) use view::{Hull, View};

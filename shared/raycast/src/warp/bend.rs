@@ -1,6 +1,7 @@
-//! A packet of rays on their way through a warp: X = x + a + s (b + s c), s = 0…1 from one plane of the view to the next.
+//! A packet of rays on their way through a warp: X = a + s (b + s c), s = 0…1 from one plane of the view to the next, the straight way included.
 //!
-//! The parabola of a lane is read when it comes into another slab between planes, for all lanes of the packet that are there.
+//! The parabola of a lane is read when it comes into another slab between planes, for all lanes of the packet that are there, and with it those that
+//! are about to come: a little before its slab ([`EARLY`]) a parabola errs by no more than within it.
 //! Gradients turn with the warp: ∇ₓ f(X(x)) = (1 + ∂v/∂x)ᵀ ∇f, the derivative at the packet's middle, linear in s.
 //!
 //! How far a lane may jump in rest space out of a box of empty cells: nowhere does it go faster, forwards or backwards along an axis, than the
@@ -17,6 +18,10 @@ use wide::f32x4;
 
 /// Parabolas are continued a little before their slab, where a hit is refined.
 const BEFORE: f32 = -0.3;
+/// So far before the slab |s (s − ½)(s − 1)| is no larger than within it.
+const EARLY: f32 = 0.07;
+/// Slabs that are kept, a power of two: lanes that have not met anything are ahead of the others.
+const KEPT: usize = 4;
 
 /// A slab as all lanes of a packet would have it: lanes come into it one after the other.
 struct Slab<L: Lanes> {
@@ -39,11 +44,14 @@ pub(crate) struct Bend<'t, 'v, L: Lanes> {
     /// slabs a step, and slab coordinate at q = 0
     rate: L::Float,
     base: L::Float,
+    /// straight rays: index steps a slab, and index at slab coordinate 0
+    straight: [L::Float; 3],
+    origin: [L::Float; 3],
     /// slab of each lane
     slab: L::Float,
     parabola: [[L::Float; 3]; 3],
-    /// the last even and the last odd slab
-    slabs: [Slab<L>; 2],
+    /// the last slabs, by number modulo [`KEPT`]
+    slabs: [Slab<L>; KEPT],
     /// s of the last samples
     local: L::Float,
     /// slab that `turn` is of
@@ -52,14 +60,19 @@ pub(crate) struct Bend<'t, 'v, L: Lanes> {
     turn: [[L::Float; 9]; 2],
     /// steps that an index takes at least, along each axis, forwards and backwards
     slowest: [[L::Float; 2]; 3],
-    /// the same whichever way it goes
-    either: [L::Float; 3],
 }
 
 impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
-    /// For the rays of a packet whose first pixel is `pixel`; `start`: distance from the eye at q = 0 [mm].
+    /// For the rays of a packet whose first pixel is `pixel`; `start`: distance from the eye at q = 0 [mm]; then the index there, and index steps a step.
     #[inline(always)]
-    pub fn new(l: L, frame: &Frame, tile: &'t mut Tile<'v>, pixel: [usize; 2], start: L::Float, delta: [L::Float; 3]) -> Self {
+    pub fn new(
+        l: L,
+        frame: &Frame,
+        tile: &'t mut Tile<'v>,
+        pixel: [usize; 2],
+        start: L::Float,
+        [origin, delta]: [[L::Float; 3]; 2],
+    ) -> Self {
         let view = tile.view;
         let rate = frame.step / view.apart;
         let zero = l.set(0.0);
@@ -71,43 +84,47 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
         let fastest = axes!(d => l.set(view.steepest[d] * frame.step));
         let least = l.set(TINY);
         let slowest = axes!(d => [l.set(1.0) / (fastest[d] + delta[d]).max(least), l.set(1.0) / (fastest[d] - delta[d]).max(least)]);
+        let base = (start - l.set(view.first)) * l.set(1.0 / view.apart);
+        let straight: [L::Float; 3] = axes!(d => delta[d] * l.set(1.0 / rate));
         Self {
             pixel,
             cell,
             shares: [left * above, across * above, left * down, across * down],
             rate: l.set(rate),
-            base: (start - l.set(view.first)) * l.set(1.0 / view.apart),
+            origin: axes!(d => origin[d] - base * straight[d]),
+            base,
+            straight,
             slab: l.set(-1e9),
             parabola: [[zero; 3]; 3],
-            slabs: [slab(zero), slab(zero)],
+            slabs: std::array::from_fn(|_| slab(zero)),
             local: zero,
             turned: l.set(-1e9),
             turn: [[zero; 9]; 2],
-            either: axes!(d => slowest[d][0].min(slowest[d][1])),
             slowest,
             tile,
         }
     }
 
-    /// Steps that an index in rest space takes at least, along each axis.
+    /// Steps that an index in rest space takes at least, along each axis, forwards and backwards.
     #[inline(always)]
-    pub fn slowest(&self) -> &[L::Float; 3] {
-        &self.either
+    pub fn slowest(&self) -> &[[L::Float; 2]; 3] {
+        &self.slowest
     }
 
-    /// Rest positions of samples at q, whose world positions are p.
+    /// Rest positions of samples at q.
     #[inline(always)]
-    pub fn bend(&mut self, l: L, q: L::Float, p: [L::Float; 3], lanes: L::Mask) -> [L::Float; 3] {
+    pub fn bend(&mut self, l: L, q: L::Float, lanes: L::Mask) -> [L::Float; 3] {
         let s = q.fma(self.rate, self.base);
         let mut local = s - self.slab;
         let left = lanes & (local.lt(l.set(BEFORE)) | local.ge(l.set(1.0)));
         if left.any() {
-            self.enter(l, s, left);
+            let soon = left | (lanes & local.ge(l.set(1.0 - EARLY)));
+            self.enter(l, s + l.set(EARLY), soon);
             local = s - self.slab;
         }
         self.local = local;
         let [a, b, c] = &self.parabola;
-        axes!(d => p[d] + local.fma(local.fma(c[d], b[d]), a[d]))
+        axes!(d => local.fma(local.fma(c[d], b[d]), a[d]))
     }
 
     /// Reads the slabs into which lanes have come.
@@ -119,12 +136,12 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
         while left.any() {
             let number = each[left.bits().trailing_zeros() as usize];
             let here = left & numbers.eq(l.int(number));
-            let parity = number as usize & 1;
-            if self.slabs[parity].number != number {
+            let place = number as usize % KEPT;
+            if self.slabs[place].number != number {
                 self.read(l, number);
             }
             self.slab = self.slab.or(here, l.set(number as f32));
-            let from = &self.slabs[parity].parabola;
+            let from = &self.slabs[place].parabola;
             for (own, from) in self.parabola.iter_mut().flatten().zip(from.iter().flatten()) {
                 *own = own.or(here, *from);
             }
@@ -136,12 +153,14 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
     #[inline(always)]
     fn read(&mut self, l: L, number: i32) {
         self.tile.fill(number as usize);
-        let slab = &mut self.slabs[number as usize & 1];
+        let slab = &mut self.slabs[number as usize % KEPT];
         slab.number = number;
         let corners = self.tile.corners(number as usize, self.cell);
         let [p, q, r, t] = self.shares;
+        let along = l.set(number as f32);
+        let start: [[L::Float; 3]; 3] = [axes!(d => along.fma(self.straight[d], self.origin[d])), self.straight, [l.set(0.0); 3]];
         for (m, out) in slab.parabola.iter_mut().enumerate() {
-            *out = axes!(d => l.set(corners[3][m][d]).fma(t, l.set(corners[2][m][d]).fma(r, l.set(corners[1][m][d]).fma(q, l.set(corners[0][m][d]) * p))));
+            *out = axes!(d => l.set(corners[3][m][d]).fma(t, l.set(corners[2][m][d]).fma(r, l.set(corners[1][m][d]).fma(q, l.set(corners[0][m][d]).fma(p, start[m][d])))));
         }
     }
 
@@ -169,7 +188,7 @@ impl<'t, 'v, L: Lanes> Bend<'t, 'v, L> {
                 let number = each[other.bits().trailing_zeros() as usize].max(0.0);
                 let wanted = l.set(number);
                 let here = other & !(self.slab.lt(wanted) | wanted.lt(self.slab));
-                let slab = &mut self.slabs[number as usize & 1];
+                let slab = &mut self.slabs[number as usize % KEPT];
                 if slab.turned != number {
                     let middle =
                         [self.pixel[0] as f32 + 0.5 * (L::ACROSS as f32 - 1.0), self.pixel[1] as f32 + 0.5 * (L::DOWN as f32 - 1.0)];
@@ -205,6 +224,7 @@ impl Warp {
     pub fn view_error_mm(
         &self,
         info: &maille_volume::VolumeInfo,
+        skip: &crate::Skip,
         camera: &crate::Camera,
         settings: &crate::Settings,
         size: [usize; 2],
@@ -219,6 +239,6 @@ impl Warp {
             ));
         }
         let frame = Frame::new(info, camera, settings, size, barrel as f32, self.margin());
-        Ok(super::view::View::new(self, &frame, size).error_mm)
+        Ok(super::view::View::new(self, &frame, Some(skip), size, crate::render::TILES).error_mm)
     }
 }

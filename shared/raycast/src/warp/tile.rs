@@ -1,9 +1,9 @@
 //! The warp in one tile of a picture: parabolas along the rays, made where rays come and kept until the tile is done.
 //!
-//! Nodes of a tile lie a quarter of the view's columns apart ([`FINE`]); at each, between two planes of the view, v(s) = a + s (b + s c),
+//! Nodes of a tile lie as near to one another as the view says (`View::fine`); at each, between two planes of the view, v(s) = a + s (b + s c),
 //! s = 0…1. One memory serves one tile after the other; a number says what in it is of the tile at hand.
 
-use super::view::{FINE, View};
+use super::view::View;
 use wide::f32x4;
 
 /// Weights of four nodes in a row for a place between the second and the third (Lagrange).
@@ -40,7 +40,7 @@ pub(crate) struct Tile<'a> {
 impl<'a> Tile<'a> {
     /// Room for tiles of at most so many pixels.
     pub fn new(view: &'a View, most: [usize; 2]) -> Self {
-        let fine = (view.pitch / FINE).max(1);
+        let fine = view.fine;
         let room = (most[0].div_ceil(fine) + 1) * (most[1].div_ceil(fine) + 1);
         let planes = view.counts[2];
         Self {
@@ -141,6 +141,20 @@ impl<'a> Tile<'a> {
         let p = &self.parabolas[slab * self.room + cell..];
         let across = self.counts[0];
         [&p[0], &p[1], &p[across], &p[across + 1]]
+    }
+
+    /// v at a pixel, as rays read it, at a distance from the eye [mm].
+    #[cfg(test)]
+    pub fn at(&mut self, pixel: [usize; 2], t: f32) -> [f32; 3] {
+        let s = ((t - self.view.first) / self.view.apart).max(0.0);
+        let slab = (s as usize).min(self.last_slab());
+        self.fill(slab);
+        let (cell, [x, y], _) = self.cell(pixel);
+        let s = s - slab as f32;
+        std::array::from_fn(|c| {
+            let v = self.corners(slab, cell).map(|[a, b, p]| a[c] + s * (b[c] + s * p[c]));
+            (1.0 - y) * ((1.0 - x) * v[0] + x * v[1]) + y * ((1.0 - x) * v[2] + x * v[3])
+        })
     }
 
     /// ∂v/∂x [mm per mm] at a pixel at the beginning of a slab, and its change to the end: for each axis d, by component.
