@@ -11,7 +11,7 @@
 
 use crate::HapticError;
 use crate::needle_port::NeedlePort;
-use maille_contact::{DevicePose, ForceShaper, Limits, TickOutputs};
+use maille_contact::{Coupling, DevicePose, DeviceProfile, ForceShaper, Limits, TickOutputs};
 use maille_contract::ControlBlock;
 use maille_contract::needle::{
     LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag,
@@ -123,12 +123,13 @@ struct Dragged {
 
 impl NeedleStage {
     /// The scene's needle; `None` when the scene has none. Everything that allocates happens here.
-    /// `device_torque_n_mm`: the real device's own limit of torque, 0 where it can give none.
+    /// `device`: what the device is like, where that is known; `device_torque_n_mm`: the real device's own limit of torque, 0 where it can give none.
     pub fn new(
         domain: &Domain,
         scene: &Scene,
         grid: &Grid,
         limits: Limits,
+        device: Option<&DeviceProfile>,
         device_torque_n_mm: Option<f64>,
     ) -> Result<Option<Self>, HapticError> {
         if !scene.has_effect("needle") {
@@ -136,7 +137,10 @@ impl NeedleStage {
         }
         let n = &scene.needle;
         let fail = |e: maille_needle::NeedleError| HapticError::Scene(format!("[needle] {e}"));
-        let (config, gauge) = config(n, &limits).map_err(fail)?;
+        let (mut config, gauge) = config(n, &limits).map_err(fail)?;
+        if let Some(device) = device {
+            config.device_n_per_mm = renders_n_per_mm(device, 1.0 / scene.haptic.rate_hz).clamp(0.01, config.device_n_per_mm);
+        }
         let materials: Vec<Material> = n.tissue.iter().map(material).collect();
         let tool = NeedleTool::new(config, MaterialTable::new(&materials).map_err(fail)?).map_err(fail)?;
         let has_labels = scene.volume.file.is_none() || scene.volume.labels.is_some();
@@ -374,6 +378,14 @@ fn fill(to: &mut [[f32; 3]; NEEDLE_NODES], points: impl Iterator<Item = V3>, roo
         *slot = [room[at].x as f32, room[at].y as f32, room[at].z as f32];
     }
     count
+}
+
+/// Stiffness that a device renders passively [N/mm]: (b − 0)/(T/2 + t_d) with a margin, no more than its maker says, and no more than twice its Coulomb
+/// friction an encoder's step [Abbott & Okamura 2005].
+fn renders_n_per_mm(device: &DeviceProfile, period_s: f64) -> f64 {
+    let held = 0.95 * Coupling::passive_stiffness_delayed(0.0, device.damping_n_s_per_mm, period_s, device.delay_s);
+    let steps = if device.quantum_mm > 0.0 && device.coulomb_n > 0.0 { 2.0 * device.coulomb_n / device.quantum_mm } else { f64::INFINITY };
+    held.min(device.max_stiffness_n_per_mm).min(steps)
 }
 
 /// The scene's table as the needle wants it.

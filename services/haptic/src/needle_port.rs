@@ -2,8 +2,10 @@
 //!
 //! E = −Σ F_k·(x_{k+1} − x_k) − Σ τ_k·δθ_{k+1}, exact for what is held between ticks [Hannaford & Ryu 2002]; x and θ are the handle's, F and τ what the
 //! device was given. A balance that falls below nought by more than the tissue's own motion accounts for says that the simulation feeds the hand.
-//! Observer only: nothing is lowered. (`maille-contact`'s controller is for walls that are stiff against a light device; the needle meets the hand
-//! through a grip of some newtons a millimetre, far below what a device renders passively, and a breath that lifts the hand does real work.)
+//! Observer only: nothing is lowered. `maille-contact`'s controller is for walls that may be stiffer than the device renders; the needle is passive by
+//! construction: all that is elastic between handle and tissue is no stiffer than that (`device_n_per_mm`, from the device's profile; tests/port.rs of
+//! `maille-needle` has hold, delay and steps of the encoder), friction and cutting only take, and a breath that lifts the hand does real work. Turns
+//! are not covered: no device here tells of its damping against them.
 //!
 //! Units: mm, N, N·mm, mJ = N·mm; frame: world. Motion of more than a jump is none. Cost: constant. Allocation: none.
 

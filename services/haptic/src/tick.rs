@@ -82,6 +82,7 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             scene,
             &reader.info().grid,
             config.limits,
+            profile.as_ref(),
             real.as_ref().and(profile.as_ref()).map(|p| p.max_torque_n_mm),
         )?;
         Ok(Self {

@@ -1,6 +1,6 @@
 //! A real 4D CT: registers its phases, judges the fields, and predicts phases that a model has not seen.
 //!
-//! `cargo run --release -p maille-motion --example fourd_ct -- FOLDER [--sliding] [--stiff] [--predict] [--phases 4,8]` with FOLDER/phase01.mha … phase10.mha.
+//! `cargo run --release -p maille-motion --example fourd_ct -- FOLDER [--sliding] [--stiff] [--stiff-mm 8] [--predict] [--phases 4,8]` with FOLDER/phase01.mha … phase10.mha.
 
 use maille_motion::model::{fit_full_cycle, fit_half_cycle, fit_surrogate};
 use maille_motion::phases::{air_ml, ends, rates, rms_hu};
@@ -43,6 +43,9 @@ fn main() {
     let mut options = RegisterOptions::default();
     if let Some(sigma) = value("--sigma").and_then(|v| v.parse().ok()) {
         options.sigma = sigma;
+    }
+    if let Some(stiff) = value("--stiff-mm").and_then(|v| v.parse().ok()) {
+        options.stiff_mm = stiff;
     }
     if let Some(list) = value("--iterations") {
         options.iterations = list.split(',').filter_map(|n| n.parse().ok()).collect();

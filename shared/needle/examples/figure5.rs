@@ -44,6 +44,15 @@ fn run(material: Material, amplitude_mm: f64, seconds: f64, depth: impl Fn(f64) 
         .collect()
 }
 
+/// Round numbers from low to high, a handful.
+fn round_steps(low: f64, high: f64) -> Vec<f64> {
+    let rough = (high - low) / 8.0;
+    let ten = 10f64.powf(rough.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].map(|m| m * ten).into_iter().find(|s| *s >= rough).unwrap_or(10.0 * ten);
+    let decimals = 10f64.powf((-step.log10()).ceil().max(0.0));
+    ((low / step).ceil() as i64..=(high / step).floor() as i64).map(|n| (n as f64 * step * decimals).round() / decimals).collect()
+}
+
 /// Curves as an SVG with axes.
 fn plot(path: &Path, title: &str, x_name: &str, curves: &[(&str, &str, Vec<[f64; 2]>)]) -> std::io::Result<()> {
     let all = || curves.iter().flat_map(|c| &c.2);
@@ -54,12 +63,19 @@ fn plot(path: &Path, title: &str, x_name: &str, curves: &[(&str, &str, Vec<[f64;
     let mut svg =
         String::from("<svg xmlns='http://www.w3.org/2000/svg' width='800' height='420' font-family='sans-serif' font-size='12'>\n");
     let _ = writeln!(svg, "<rect width='800' height='420' fill='white'/><text x='60' y='24' font-size='15'>{title}</text>");
-    for k in 0..=8 {
-        let (x, y) = (x0 + (x1 - x0) * f64::from(k) / 8.0, y0 + (y1 - y0) * f64::from(k) / 8.0);
-        let _ = writeln!(svg, "<path d='M{0:.1} 40V360' stroke='#ddd'/><text x='{0:.1}' y='376' text-anchor='middle'>{x:.1}</text>", px(x));
-        let _ = writeln!(svg, "<path d='M60 {0:.1}H760' stroke='#ddd'/><text x='54' y='{0:.1}' text-anchor='end'>{y:.2}</text>", py(y));
+    for x in round_steps(x0, x1) {
+        let _ = writeln!(svg, "<path d='M{0:.1} 40V360' stroke='#ddd'/><text x='{0:.1}' y='376' text-anchor='middle'>{x}</text>", px(x));
     }
-    let _ = writeln!(svg, "<text x='410' y='400' text-anchor='middle'>{x_name}</text><text x='8' y='36'>force [N]</text>");
+    for y in round_steps(y0, y1) {
+        let _ = writeln!(
+            svg,
+            "<path d='M60 {0:.1}H760' stroke='#ddd'/><text x='54' y='{1:.1}' text-anchor='end'>{y}</text>",
+            py(y),
+            py(y) + 4.0
+        );
+    }
+    let _ = writeln!(svg, "<text x='410' y='400' text-anchor='middle'>{x_name}</text>");
+    let _ = writeln!(svg, "<text x='16' y='200' text-anchor='middle' transform='rotate(-90 16 200)'>force [N]</text>");
     for (n, (name, colour, points)) in curves.iter().enumerate() {
         let line: Vec<String> = points.iter().step_by(20).map(|p| format!("{:.1},{:.1}", px(p[0]), py(p[1]))).collect();
         let _ = writeln!(svg, "<polyline fill='none' stroke='{colour}' stroke-width='1.4' points='{}'/>", line.join(" "));

@@ -172,6 +172,18 @@ impl MaterialTable {
         table
     }
 
+    /// The same tissues with the springs at their tips no stiffer than `most_n_per_mm` at any force up to `max_force_n` or that of cutting.
+    pub(crate) fn no_stiffer_than(mut self, most_n_per_mm: f64, max_force_n: f64) -> Self {
+        for m in &mut self.of[..self.count] {
+            let force = m.capsule.map_or(0.0, |c| c.cutting_force_n).max(m.cutting_force_n).min(max_force_n);
+            m.a1_n_per_mm = m.a1_n_per_mm.min(most_n_per_mm);
+            // the slope there is √(a₁² + 4 a₂ f)
+            let room = (most_n_per_mm.powi(2) - m.a1_n_per_mm.powi(2)).max(0.0);
+            m.a2_n_per_mm2 = if force > 0.0 { m.a2_n_per_mm2.min(room / (4.0 * force)) } else { m.a2_n_per_mm2 };
+        }
+        self
+    }
+
     /// A material; one that the table does not have is the last it has.
     #[inline]
     pub fn get(&self, index: u8) -> &Material {
@@ -220,6 +232,17 @@ mod tests {
         let table = MaterialTable::abdomen();
         let of: Vec<Material> = (1..table.count()).map(|i| *table.get(i as u8)).collect();
         assert_eq!(MaterialTable::new(&of).unwrap().count(), table.count());
+        // a device that renders a newton a millimetre
+        let soft = table.no_stiffer_than(1.0, 3.3);
+        for i in 1..table.count() {
+            let (m, was) = (soft.get(i as u8), table.get(i as u8));
+            let force = m.cutting_force_n.min(3.3);
+            let slope = (m.a1_n_per_mm.powi(2) + 4.0 * m.a2_n_per_mm2 * force).sqrt();
+            assert!(slope <= 1.0 + 1e-12 && m.a1_n_per_mm == was.a1_n_per_mm.min(1.0) && m.friction_n == was.friction_n);
+        }
+        let hard = MaterialTable::new(&[Material { a2_n_per_mm2: 0.5, ..Material::LIVER }]).unwrap().no_stiffer_than(1.0, 3.3);
+        let m = hard.get(1);
+        assert!(((m.a1_n_per_mm.powi(2) + 4.0 * m.a2_n_per_mm2 * 2.5).sqrt() - 1.0).abs() < 1e-12);
         let wrong = Material { a1_n_per_mm: 0.0, ..Material::LIVER };
         assert!(MaterialTable::new(&[wrong]).unwrap_err().to_string().contains("a1_n_per_mm"));
         assert!(MaterialTable::new(&[]).is_err());

@@ -4,12 +4,16 @@
 
 mod common;
 
-use common::{Breath, DT, LENGTH, half_space, needle, straight, tick};
-use maille_needle::{Breathing, HandlePose, Inputs, Material, NeedleTool, V3};
+use common::{Breath, DT, LENGTH, config, half_space, needle, straight, tick, with};
+use maille_needle::{Breathing, HandlePose, Inputs, Material, NeedleConfig, NeedleTool, RodParameters, V3};
 
 /// A needle put in while the patient breathes.
 fn inserted(breath: Breath, depth: f64) -> (NeedleTool, f64) {
-    let mut tool = needle(Material::LIVER_TRAINING);
+    put_in(needle(Material::LIVER_TRAINING), breath, depth)
+}
+
+/// This needle, put in while the patient breathes.
+fn put_in(mut tool: NeedleTool, breath: Breath, depth: f64) -> (NeedleTool, f64) {
     let seconds = depth / 10.0;
     let mut t = 0.0;
     while t < seconds {
@@ -64,6 +68,59 @@ fn the_tip_of_a_needle_let_go_stays_where_it_is_in_the_tissue() {
         assert!(drift < 0.05 && path_drift == 0.0 && residual <= 1e-5, "{drift} {path_drift} {residual}");
         // the handle is moved by the breath
         assert!(travel > 1.5, "{travel}");
+    }
+}
+
+/// How far a needle that was let go is from where breathing alone would carry its tip, apart: across and along it where the tissue holds it, and Δd; and how far
+/// it travels in the patient at rest, without and with Δd. All over one breath, after two.
+fn pulled(config: NeedleConfig, material: Material, depth: f64) -> [f64; 5] {
+    let breath = Breath::new(12.0);
+    let (mut tool, start) = put_in(with(config, material), breath, depth);
+    let (mut across, mut along, mut ahead): (f64, f64, f64) = (0.0, 0.0, 0.0);
+    let mut places: Vec<[V3; 2]> = Vec::new();
+    for n in 0..12_000 {
+        let breathing = breath.at(start + f64::from(n) * DT);
+        let out = tool.tick(&Inputs { dt_s: DT, handle: straight(0.0), held: false, breathing: &breathing, tissue: &half_space });
+        if n >= 8000 {
+            let at = tool.path().tip().unwrap().reference;
+            let (tip, axis) = (V3::from(out.tip_mm), tool.rod().tip_tangent());
+            let off = tip - at - V3::from(breathing.displacement(at.into()));
+            along = along.max(off.dot(&axis).abs());
+            across = across.max((off - axis * off.dot(&axis)).norm());
+            ahead = ahead.max(out.ahead_mm);
+            places.push([tip, tip + tool.ahead()].map(|x| V3::from(breathing.to_reference(x.into(), at.into()))));
+        }
+    }
+    let travel = |k: usize| places.iter().map(|p| (p[k] - places[0][k]).norm()).fold(0.0, f64::max);
+    [across, along, ahead, travel(0), travel(1)]
+}
+
+#[test]
+fn what_moves_the_tip_of_a_free_needle_in_its_tissue_is_its_own_stiffness_and_friction_and_nothing_else() {
+    let soft = |c: NeedleConfig| NeedleConfig { rod: RodParameters { bending_n_mm2: c.rod.bending_n_mm2 / 1000.0, ..c.rod }, ..c };
+    let smooth = Material { friction_n: 1e-9, ..Material::LIVER_TRAINING };
+    for depth in [20.0, 60.0, 110.0] {
+        let whole = pulled(config(), Material::LIVER_TRAINING, depth);
+        let no_friction = pulled(config(), smooth, depth);
+        let no_stiffness = pulled(soft(config()), Material::LIVER_TRAINING, depth);
+        let neither = pulled(soft(config()), smooth, depth);
+        for (name, [across, along, ahead, bare, drawn]) in
+            [("as it is", whole), ("without friction", no_friction), ("a thousandth of its stiffness", no_stiffness), ("neither", neither)]
+        {
+            println!(
+                "{depth} mm deep, {name}: tip off its tissue {across:.4} mm across, {along:.1e} along, ahead {ahead:.4}; travels {bare:.4} mm a breath at rest, {drawn:.4} with what it is ahead"
+            );
+        }
+        // along, nothing drags behind
+        assert!(whole[1] < 1e-3, "{whole:?}");
+        // friction against the tip's spring is what pushes the tip ahead; a straight needle in a bowed channel is what pulls it aside
+        assert!(no_friction[2] < 1e-6 && (no_friction[0] - whole[0]).abs() < 1e-3, "{whole:?} {no_friction:?}");
+        assert!(
+            no_stiffness[0] < 0.5 * whole[0] && no_stiffness[0] < 0.005 && (no_stiffness[2] - whole[2]).abs() < 1e-3,
+            "{whole:?} {no_stiffness:?}"
+        );
+        // without both it stays where breathing alone carries its tissue
+        assert!(neither[4] < 0.01, "{neither:?}");
     }
 }
 

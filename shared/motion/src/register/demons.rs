@@ -1,6 +1,6 @@
 //! The demons and their regularisation; see the module above.
 
-use super::pyramid::{Lattice, double, gradient, halve, smooth, trilinear};
+use super::pyramid::{Lattice, Wanted, double, gradient, halve, smooth, smooth_lines, trilinear};
 use crate::resample::jacobian_determinant;
 use maille_displacement::in_patient;
 use maille_volume::{Grid, ScalarField, VectorField};
@@ -32,7 +32,7 @@ pub struct Anatomy<'a> {
 
 impl Default for RegisterOptions {
     fn default() -> Self {
-        Self { iterations: vec![60, 50, 30], sigma: 1.0, kappa: 1.4, stiff_mm: 4.0, least_determinant: 0.1 }
+        Self { iterations: vec![60, 50, 30], sigma: 1.0, kappa: 1.4, stiff_mm: 8.0, least_determinant: 0.1 }
     }
 }
 
@@ -45,13 +45,15 @@ struct Level {
     bone: Option<Bone>,
 }
 
-/// Bone as smoothing sees it.
+/// Bone as smoothing sees it, on blocks of two nodes an axis: the stiffness is far wider than those.
 struct Bone {
-    /// 1 in bone
-    inside: Vec<f32>,
-    /// its Gaussian, of the stiffness's width
+    /// nodes in bone, by slice, within their slice
+    nodes: Vec<Vec<u32>>,
+    /// the blocks
+    blocks: Lattice,
+    /// Gaussian of how much bone is in a block, of the stiffness's width
     share: Vec<f32>,
-    /// σ [nodes]
+    /// σ [blocks]
     sigma: f32,
 }
 
@@ -64,8 +66,10 @@ struct Border {
     inside: Vec<f32>,
     /// its Gaussian
     share: Vec<f32>,
-    /// unit normal, and how much the border is near: 0 … 1
-    normal: Vec<[f32; 4]>,
+    /// nodes where that sees both sides, with the border's unit normal; by slice, within their slice
+    near: Vec<Vec<(u32, [f32; 3])>>,
+    /// lines that hold such nodes: of them alone each side's own Gaussian is wanted
+    wanted: Wanted,
 }
 
 /// A field, one array a component, along the grid's axes [mm].
@@ -116,7 +120,7 @@ pub fn register(
             Some((field, side)) => field.each_ref().map(|f| double_by_side(&lattice, f, side.as_deref(), slides.as_deref())),
         };
         let border = slides.map(|m| Border::new(&lattice, m, options.sigma));
-        let bone = stiff.map(|m| Bone::new(&lattice, m, options.stiff_mm));
+        let bone = stiff.map(|m| Bone::new(&lattice, &m, options.stiff_mm));
         let level = Level { lattice, reference, phase, border, bone };
         level.run(&mut field, options, options.iterations[n + skipped], |iteration, rms| progress(n, iteration, rms));
         coarser = Some((field, level.border.map(|b| b.inside)));
@@ -132,15 +136,19 @@ impl Border {
         smooth(lattice, sigma, &mut share, &mut spare);
         let mut soft = inside.clone();
         smooth(lattice, 1.5, &mut soft, &mut spare);
-        let [nx, ny, _] = lattice.size;
-        let normal = |n: usize| {
-            let g = gradient(lattice, &soft, [n % nx, n / nx % ny, n / (nx * ny)]);
-            let length = g.iter().map(|c| c * c).sum::<f32>().sqrt().max(1e-9);
-            // near is where the Gaussian of S sees both sides
-            let near = if share[n] > 0.02 && share[n] < 0.98 { 1.0 } else { 0.0 };
-            [g[0] / length, g[1] / length, g[2] / length, near]
+        let ([nx, _, nz], slice) = (lattice.size, lattice.slice());
+        let of_slice = |k: usize| -> Vec<(u32, [f32; 3])> {
+            let near = (0..slice).filter(|n| share[k * slice + n] > 0.02 && share[k * slice + n] < 0.98);
+            near.map(|n| {
+                let g = gradient(lattice, &soft, [n % nx, n / nx, k]);
+                let length = g.iter().map(|c| c * c).sum::<f32>().sqrt().max(1e-9);
+                (n as u32, g.map(|c| c / length))
+            })
+            .collect()
         };
-        Self { normal: (0..lattice.count()).into_par_iter().map(normal).collect(), inside, share }
+        let near: Vec<_> = (0..nz).into_par_iter().map(of_slice).collect();
+        let wanted = Wanted::new(lattice, sigma, near.iter().map(|slice| slice.iter().map(|(n, _)| *n as usize / nx)));
+        Self { near, wanted, inside, share }
     }
 }
 
@@ -162,22 +170,47 @@ fn double_by_side(fine: &Lattice, values: &[f32], coarse_inside: Option<&[f32]>,
 }
 
 impl Bone {
-    fn new(lattice: &Lattice, inside: Vec<f32>, stiff_mm: f32) -> Self {
-        let sigma = (stiff_mm / lattice.spacing.iter().copied().fold(f32::INFINITY, f32::min)).max(0.5);
-        let mut share = inside.clone();
-        smooth(lattice, sigma, &mut share, &mut Vec::new());
-        Self { inside, share, sigma }
+    fn new(lattice: &Lattice, inside: &[f32], stiff_mm: f32) -> Self {
+        let slices = inside.chunks(lattice.slice());
+        let nodes = slices.map(|slice| (0..slice.len() as u32).filter(|&n| slice[n as usize] > 0.5).collect()).collect();
+        let blocks = Lattice { size: lattice.size.map(|s| s.div_ceil(2)), spacing: lattice.spacing.map(|s| 2.0 * s) };
+        let sigma = (stiff_mm / blocks.spacing.iter().copied().fold(f32::INFINITY, f32::min)).max(0.5);
+        let mut bone = Self { nodes, blocks, share: Vec::new(), sigma };
+        let (mut share, mut spare) = (Vec::new(), Vec::new());
+        bone.gather(lattice, |_| 1.0, &mut share);
+        smooth(&blocks, sigma, &mut share, &mut spare);
+        bone.share = share;
+        bone
+    }
+
+    /// Sums over the bone in each block.
+    fn gather(&self, lattice: &Lattice, value: impl Fn(usize) -> f32 + Sync, into: &mut Vec<f32>) {
+        let ([bx, by, _], [nx, _, _], slice) = (self.blocks.size, lattice.size, lattice.slice());
+        into.clear();
+        into.resize(self.blocks.count(), 0.0);
+        into.par_chunks_mut(bx * by).zip(self.nodes.par_chunks(2)).enumerate().for_each(|(layer, (into, slices))| {
+            for (k, nodes) in slices.iter().enumerate() {
+                for &n in nodes {
+                    let (i, j) = (n as usize % nx, n as usize / nx);
+                    into[j / 2 * bx + i / 2] += value((2 * layer + k) * slice + n as usize);
+                }
+            }
+        });
     }
 
     /// u in bone ← its mean over bone nearby.
     fn stiffen(&self, lattice: &Lattice, field: &mut Components, part: &mut Vec<f32>, spare: &mut Vec<f32>) {
+        let ([nx, _, _], slice) = (lattice.size, lattice.slice());
         for u in field {
-            part.clear();
-            part.par_extend(u.par_iter().zip(&self.inside).map(|(u, m)| u * m));
-            smooth(lattice, self.sigma, part, spare);
-            u.par_iter_mut().zip(&*part).zip(&self.inside).zip(&self.share).for_each(|(((u, p), &m), s)| {
-                if m > 0.5 {
-                    *u = p / s;
+            self.gather(lattice, |n| u[n], part);
+            smooth(&self.blocks, self.sigma, part, spare);
+            part.par_iter_mut().zip(&self.share).for_each(|(p, &s)| *p = if s > 0.0 { *p / s } else { 0.0 });
+            let part = &*part;
+            u.par_chunks_mut(slice).zip(&self.nodes).enumerate().for_each(|(k, (u, nodes))| {
+                for &n in nodes {
+                    // the middle of a block lies between its nodes
+                    let at = [n as usize % nx, n as usize / nx, k].map(|i| 0.5 * i as f32 - 0.25);
+                    u[n as usize] = trilinear(&self.blocks, part, at);
                 }
             });
         }
@@ -188,23 +221,27 @@ impl Level {
     fn run(&self, field: &mut Components, options: &RegisterOptions, iterations: usize, mut progress: impl FnMut(usize, f32)) {
         let lattice = &self.lattice;
         let ([nx, ny, _], slice) = (lattice.size, lattice.slice());
-        let mut warped = vec![0.0; lattice.count()];
+        // the reference and the phase as it would see it, together: the force asks for their common gradient
+        let mut both = vec![0.0; lattice.count()];
         let (mut sides, mut spare): (Components, _) = (std::array::from_fn(|_| Vec::new()), Vec::new());
         let smallest = lattice.spacing.iter().copied().fold(f32::INFINITY, f32::min);
         let per_kappa2 = 1.0 / (options.kappa * smallest).powi(2);
+        let per_mm = lattice.spacing.map(|s| 1.0 / s);
+        let last = lattice.size.map(|s| (s - 1) as f32);
         for iteration in 0..iterations {
-            // the phase as the reference would see it; NaN where it lies outside
             let [ux, uy, uz] = &*field;
-            warped.par_chunks_mut(slice).enumerate().for_each(|(k, out)| {
-                for (at, out) in out.iter_mut().enumerate() {
-                    let (i, j, n) = (at % nx, at / nx, k * slice + at);
-                    let index = [
-                        i as f32 + ux[n] / lattice.spacing[0],
-                        j as f32 + uy[n] / lattice.spacing[1],
-                        k as f32 + uz[n] / lattice.spacing[2],
-                    ];
-                    let outside = (0..3).any(|c| index[c] < 0.0 || index[c] > (lattice.size[c] - 1) as f32);
-                    *out = if outside { self.reference[n] } else { trilinear(lattice, &self.phase, index) };
+            both.par_chunks_mut(slice).enumerate().for_each(|(k, out)| {
+                for (j, out) in out.chunks_exact_mut(nx).enumerate() {
+                    let first = k * slice + j * nx;
+                    let row = first..first + nx;
+                    let (ux, uy, uz) = (&ux[row.clone()], &uy[row.clone()], &uz[row.clone()]);
+                    let reference = &self.reference[row];
+                    for i in 0..nx {
+                        let index = [i as f32 + ux[i] * per_mm[0], j as f32 + uy[i] * per_mm[1], k as f32 + uz[i] * per_mm[2]];
+                        let inside = (0..3).all(|c| index[c] >= 0.0 && index[c] <= last[c]);
+                        // what lies outside is as the reference, and forces nothing
+                        out[i] = reference[i] + if inside { trilinear(lattice, &self.phase, index) } else { reference[i] };
+                    }
                 }
             });
             let [ux, uy, uz] = field;
@@ -215,17 +252,11 @@ impl Level {
                 .enumerate()
                 .map(|(k, ((ux, uy), uz))| {
                     let mut squares = 0.0f64;
-                    for at in 0..slice {
-                        let n = k * slice + at;
-                        let d = self.reference[n] - warped[n];
-                        squares += f64::from(d * d);
-                        let place = [at % nx, at / nx, k];
-                        let (a, b) = (gradient(lattice, &self.reference, place), gradient(lattice, &warped, place));
-                        let j: [f32; 3] = std::array::from_fn(|c| 0.5 * (a[c] + b[c]));
-                        let scale = d / (j.iter().map(|c| c * c).sum::<f32>() + d * d * per_kappa2 + 1e-3);
-                        ux[at] += scale * j[0];
-                        uy[at] += scale * j[1];
-                        uz[at] += scale * j[2];
+                    for j in 0..ny {
+                        let rows = Around::new(lattice, &both, j, k);
+                        let reference = &self.reference[k * slice + j * nx..][..nx];
+                        let [ux, uy, uz] = [&mut *ux, &mut *uy, &mut *uz].map(|u| &mut u[j * nx..(j + 1) * nx]);
+                        squares += f64::from(rows.push(reference, [ux, uy, uz], per_kappa2));
                     }
                     squares
                 })
@@ -247,28 +278,78 @@ impl Level {
             for (side, u) in sides.iter_mut().zip(&*field) {
                 side.clear();
                 side.par_extend(u.par_iter().zip(&border.inside).map(|(u, m)| u * m));
-                smooth(lattice, sigma, side, spare);
+                smooth_lines(lattice, sigma, side, spare, Some(&border.wanted));
             }
         }
         field.iter_mut().for_each(|u| smooth(lattice, sigma, u, spare));
         let Some(border) = &self.border else { return };
+        let slice = lattice.slice();
         let [ux, uy, uz] = field;
-        ux.par_iter_mut().zip(uy).zip(uz).enumerate().for_each(|(n, ((ux, uy), uz))| {
-            let [a, b, c, near] = border.normal[n];
-            if near == 0.0 {
-                return;
+        let slices = ux.par_chunks_mut(slice).zip(uy.par_chunks_mut(slice)).zip(uz.par_chunks_mut(slice)).zip(&border.near).enumerate();
+        slices.for_each(|(k, (((ux, uy), uz), near))| {
+            for &(at, [a, b, c]) in near {
+                let (at, n) = (at as usize, k * slice + at as usize);
+                let whole = [ux[at], uy[at], uz[at]];
+                let inner = [sides[0][n], sides[1][n], sides[2][n]];
+                // Gaussians are linear: what is not inside is outside
+                let own: [f32; 3] = if border.inside[n] > 0.5 {
+                    inner.map(|v| v / border.share[n])
+                } else {
+                    std::array::from_fn(|d| (whole[d] - inner[d]) / (1.0 - border.share[n]))
+                };
+                let along = (whole[0] - own[0]) * a + (whole[1] - own[1]) * b + (whole[2] - own[2]) * c;
+                (ux[at], uy[at], uz[at]) = (own[0] + along * a, own[1] + along * b, own[2] + along * c);
             }
-            let whole = [*ux, *uy, *uz];
-            let inner = [sides[0][n], sides[1][n], sides[2][n]];
-            // Gaussians are linear: what is not inside is outside
-            let own: [f32; 3] = if border.inside[n] > 0.5 {
-                inner.map(|v| v / border.share[n])
-            } else {
-                std::array::from_fn(|d| (whole[d] - inner[d]) / (1.0 - border.share[n]))
-            };
-            let along = (whole[0] - own[0]) * a + (whole[1] - own[1]) * b + (whole[2] - own[2]) * c;
-            (*ux, *uy, *uz) = (own[0] + along * a, own[1] + along * b, own[2] + along * c);
         });
+    }
+}
+
+/// A row of R + P∘(1 + u) and its four neighbours, with what makes of their differences half a gradient [1/mm].
+struct Around<'a> {
+    here: &'a [f32],
+    /// −j, +j, −k, +k
+    beside: [&'a [f32]; 4],
+    /// inside the row, at its ends, along j, along k
+    per_mm: [f32; 4],
+}
+
+impl<'a> Around<'a> {
+    fn new(lattice: &Lattice, both: &'a [f32], j: usize, k: usize) -> Self {
+        let [nx, ny, nz] = lattice.size;
+        let row = |j: usize, k: usize| &both[k * lattice.slice() + j * nx..][..nx];
+        let ([a, b], [c, d]) = ([j.saturating_sub(1), (j + 1).min(ny - 1)], [k.saturating_sub(1), (k + 1).min(nz - 1)]);
+        let [x, y, z] = lattice.spacing.map(|s| 0.5 / s);
+        Self {
+            here: row(j, k),
+            beside: [row(a, k), row(b, k), row(j, c), row(j, d)],
+            per_mm: [0.5 * x, x, y / (b - a) as f32, z / (d - c) as f32],
+        }
+    }
+
+    /// u ← u + d·J/(|J|² + d²/κ²) in the row; Σ d².
+    fn push(&self, reference: &[f32], [ux, uy, uz]: [&mut [f32]; 3], per_kappa2: f32) -> f32 {
+        let n = self.here.len();
+        let [south, north, below, above] = self.beside.map(|row| &row[..n]);
+        let (here, reference) = (&self.here[..n], &reference[..n]);
+        let (ux, uy, uz) = (&mut ux[..n], &mut uy[..n], &mut uz[..n]);
+        let mut squares = [0.0f32; 8];
+        let mut at = |i: usize, low: usize, high: usize, per_mm: f32| {
+            // R − P∘(1 + u)
+            let d = 2.0 * reference[i] - here[i];
+            let x = (here[high] - here[low]) * per_mm;
+            let (y, z) = ((north[i] - south[i]) * self.per_mm[2], (above[i] - below[i]) * self.per_mm[3]);
+            let scale = d / (x * x + y * y + z * z + d * d * per_kappa2 + 1e-3);
+            ux[i] += scale * x;
+            uy[i] += scale * y;
+            uz[i] += scale * z;
+            squares[i % 8] += d * d;
+        };
+        at(0, 0, 1, self.per_mm[1]);
+        for i in 1..n - 1 {
+            at(i, i - 1, i + 1, self.per_mm[0]);
+        }
+        at(n - 1, n - 2, n - 1, self.per_mm[1]);
+        squares.iter().sum()
     }
 }
 

@@ -37,17 +37,51 @@ fn taps(sigma: f32) -> Vec<f32> {
     taps
 }
 
+/// Lines along i whose smoothed values are wanted, and those that they are made of.
+pub(super) struct Wanted {
+    /// smoothed along i, along i and j, and whole; one truth a line
+    lines: [Vec<bool>; 3],
+}
+
+impl Wanted {
+    /// By slice, the lines that are wanted of a Gaussian of `sigma` nodes.
+    pub fn new(lattice: &Lattice, sigma: f32, wanted: impl Iterator<Item = impl Iterator<Item = usize>>) -> Self {
+        let ([_, ny, nz], radius) = (lattice.size, taps(sigma).len() - 1);
+        let mut whole = vec![false; ny * nz];
+        wanted.enumerate().for_each(|(k, slice)| slice.for_each(|j| whole[k * ny + j] = true));
+        let (mut along_j, mut along_i) = (vec![false; ny * nz], vec![false; ny * nz]);
+        for (n, _) in whole.iter().enumerate().filter(|(_, w)| **w) {
+            let (j, k) = (n % ny, n / ny);
+            (k.saturating_sub(radius)..(k + radius + 1).min(nz)).for_each(|k| along_j[k * ny + j] = true);
+        }
+        for (n, _) in along_j.iter().enumerate().filter(|(_, w)| **w) {
+            let (j, k) = (n % ny, n / ny);
+            along_i[k * ny + j.saturating_sub(radius)..k * ny + (j + radius + 1).min(ny)].fill(true);
+        }
+        Self { lines: [along_i, along_j, whole] }
+    }
+}
+
 /// Smooths by a Gaussian of `sigma` nodes along every axis; `spare` is memory.
 pub(super) fn smooth(lattice: &Lattice, sigma: f32, values: &mut [f32], spare: &mut Vec<f32>) {
+    smooth_lines(lattice, sigma, values, spare, None);
+}
+
+/// The same in some lines alone; the others are left in no particular state.
+pub(super) fn smooth_lines(lattice: &Lattice, sigma: f32, values: &mut [f32], spare: &mut Vec<f32>, only: Option<&Wanted>) {
     let taps = taps(sigma);
     let ([nx, ny, nz], slice) = (lattice.size, lattice.slice());
+    let skip = |stage: usize, j: usize, k: usize| only.is_some_and(|wanted| !wanted.lines[stage][k * ny + j]);
     spare.resize(values.len(), 0.0);
     // along i and j within a slice
-    spare.par_chunks_mut(slice).zip(values.par_chunks(slice)).for_each(|(out, source)| {
+    spare.par_chunks_mut(slice).zip(values.par_chunks(slice)).enumerate().for_each(|(k, (out, source))| {
         let radius = taps.len() - 1;
         let mut padded = vec![0.0; nx + 2 * radius];
         let mut rows = vec![0.0; slice];
-        for (row, out) in source.chunks_exact(nx).zip(rows.chunks_exact_mut(nx)) {
+        for (j, (row, out)) in source.chunks_exact(nx).zip(rows.chunks_exact_mut(nx)).enumerate() {
+            if skip(0, j, k) {
+                continue;
+            }
             padded[..radius].fill(row[0]);
             padded[radius..radius + nx].copy_from_slice(row);
             padded[radius + nx..].fill(row[nx - 1]);
@@ -58,6 +92,9 @@ pub(super) fn smooth(lattice: &Lattice, sigma: f32, values: &mut [f32], spare: &
             }
         }
         for j in 0..ny {
+            if skip(1, j, k) {
+                continue;
+            }
             let out = &mut out[j * nx..(j + 1) * nx];
             out.iter_mut().zip(&rows[j * nx..]).for_each(|(o, v)| *o = taps[0] * v);
             for (t, &w) in taps.iter().enumerate().skip(1) {
@@ -67,10 +104,15 @@ pub(super) fn smooth(lattice: &Lattice, sigma: f32, values: &mut [f32], spare: &
         }
     });
     values.par_chunks_mut(slice).enumerate().for_each(|(k, out)| {
-        out.iter_mut().zip(&spare[k * slice..]).for_each(|(o, v)| *o = taps[0] * v);
-        for (t, &w) in taps.iter().enumerate().skip(1) {
-            let (low, high) = (k.saturating_sub(t) * slice, (k + t).min(nz - 1) * slice);
-            out.iter_mut().zip(spare[low..low + slice].iter().zip(&spare[high..high + slice])).for_each(|(o, (a, b))| *o += w * (a + b));
+        for (j, out) in out.chunks_exact_mut(nx).enumerate() {
+            if skip(2, j, k) {
+                continue;
+            }
+            out.iter_mut().zip(&spare[k * slice + j * nx..]).for_each(|(o, v)| *o = taps[0] * v);
+            for (t, &w) in taps.iter().enumerate().skip(1) {
+                let (low, high) = (k.saturating_sub(t) * slice + j * nx, (k + t).min(nz - 1) * slice + j * nx);
+                out.iter_mut().zip(spare[low..low + nx].iter().zip(&spare[high..high + nx])).for_each(|(o, (a, b))| *o += w * (a + b));
+            }
         }
     });
 }
@@ -146,6 +188,13 @@ mod tests {
         bump[8 * 21 * 19 + 9 * 21 + 10] = 1.0;
         smooth(&lattice, 1.2, &mut bump, &mut spare);
         assert!((bump.iter().sum::<f32>() - 1.0).abs() < 1e-5 && bump.iter().all(|v| *v >= 0.0));
+        // some lines alone: as they are among all
+        let (mut all, mut some) = (linear.clone(), linear.clone());
+        smooth(&lattice, 1.7, &mut all, &mut spare);
+        let lines = |k: usize| if k == 8 { vec![3, 4] } else { vec![] };
+        smooth_lines(&lattice, 1.7, &mut some, &mut vec![], Some(&Wanted::new(&lattice, 1.7, (0..17).map(|k| lines(k).into_iter()))));
+        let line = 8 * 21 * 19 + 3 * 21;
+        assert_eq!(some[line..line + 42], all[line..line + 42]);
         // halved and doubled again, a linear function is itself
         let again = double(&lattice, &halve(&lattice, &linear));
         assert!(

@@ -1,8 +1,17 @@
 //! Along the needle: friction (eq. 6 and 7), the tip's spring, relaxation, and the balance of a needle that nobody holds.
+//!
+//! **What a device can hold.** The friction springs of a long path add up: k/Δp newtons a millimetre for each millimetre of it, 10 N/mm at 100 mm. A force that
+//! is held for a tick makes of a stiffness K a damping of −K·T/2, and −K·t_d more where poses are late [Colgate & Schenkel 1997], so that a desktop
+//! device in a light hand buzzes in its own friction. The paper limits the change of friction a frame instead; that is one more delay, and does not end it
+//! (`tests/port.rs`). Here the springs give more, k·σ with σ ≤ 1 such that tip and friction together are no stiffer than
+//! [`NeedleConfig::device_n_per_mm`](crate::NeedleConfig); Δx_i may then be R/(k·σ), and friction itself stays R. The tip's own spring is limited to
+//! [`TIP_SHARE`] of it.
 
 use super::NeedleTool;
 use crate::AIR;
 
+/// Part of what the device can hold that is the tip's; friction has what is left of the whole.
+pub(super) const TIP_SHARE: f64 = 0.75;
 /// Cutting over this length makes relaxed tissue fresh [mm].
 const FRESH_MM: f64 = 1.0;
 /// Time in which a needle that was let go comes to its balance [s].
@@ -24,6 +33,18 @@ impl NeedleTool {
         energy
     }
 
+    /// σ for the path as it is.
+    pub(super) fn soften(&mut self) {
+        self.softened = 1.0;
+        let friction: f64 = (1..self.path.nodes().len()).map(|i| self.friction_stiffness(i)).sum();
+        let tip = *self.path.tip().map_or(self.table.get(AIR), |t| self.table.get(t.material));
+        let slope = tip.a1_n_per_mm + 2.0 * tip.a2_n_per_mm2 * (self.ahead_mm - self.path.preload_mm()).max(0.0);
+        let room = self.config.device_n_per_mm - slope.min(TIP_SHARE * self.config.device_n_per_mm);
+        if friction > room {
+            self.softened = room / friction;
+        }
+    }
+
     /// Eq. 6: the shaft moves past each node by what the hand moved less what the node itself moved along the needle.
     pub(super) fn rub(&mut self, forward: f64) {
         let mut now = 0.0;
@@ -33,17 +54,17 @@ impl NeedleTool {
             }
             let moved = self.arc.get(i).map_or(0.0, |before| now - before);
             let material = *self.table.get(self.path.nodes()[i].material);
-            let most = material.friction_n / material.stiffness_n_per_mm;
+            let most = material.friction_n / (material.stiffness_n_per_mm * self.softened);
             let node = &mut self.path.nodes_mut()[i];
             node.slip_mm = (node.slip_mm + forward - moved).clamp(-most, most);
         }
     }
 
-    /// k_i·‖p_i − p_{i−1}‖/Δp [N/mm] of eq. 7.
+    /// σ·k_i·‖p_i − p_{i−1}‖/Δp [N/mm] of eq. 7.
     pub(super) fn friction_stiffness(&self, i: usize) -> f64 {
         let nodes = self.path.nodes();
         let piece = (nodes[i].reference - nodes[i - 1].reference).norm() / self.path.spacing_mm();
-        self.table.get(nodes[i].material).stiffness_n_per_mm * piece
+        self.softened * self.table.get(nodes[i].material).stiffness_n_per_mm * piece
     }
 
     /// Eq. 7 before its limit [N].

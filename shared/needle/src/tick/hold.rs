@@ -39,6 +39,15 @@ impl NeedleTool {
         (axis * cos + towards * sin).try_normalize(1e-9).unwrap_or(axis)
     }
 
+    /// A needle that nobody holds begins its step where the tissue at its tip has gone.
+    pub(super) fn go_along(&mut self, held: bool) {
+        let tip = self.world.last().copied().filter(|_| !held);
+        if let (Some(before), Some(now)) = (self.carried, tip) {
+            self.rod.shift(now - before);
+        }
+        self.carried = tip;
+    }
+
     /// Line 13: the rod between its grip and its path.
     pub(super) fn solve(&mut self, held: bool, dt: f64) -> Solved {
         let length = self.config.rod.length_mm;

@@ -18,7 +18,8 @@
 //! the tip in all directions. Outside the body the needle is free: tissue that moves tilts it about the skin (lever).
 //!
 //! **Let go** (`held = false`): nothing holds the base; the rod is carried by tissue, neither cuts nor slides at its tip, pushes itself back until
-//! friction and the tip's spring balance, and the handle is where its base is.
+//! friction and the tip's spring balance, and the handle is where its base is. The rod's drag is then against the tissue at its tip, not against the world:
+//! else a breath would drag it behind.
 //!
 //! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre.
 //!
@@ -65,8 +66,12 @@ pub struct NeedleTool {
     inserted_mm: Option<f64>,
     /// Δd while let go [mm]
     ahead_mm: f64,
+    /// w_l at the last tick, while nobody holds the needle [mm]
+    carried: Option<V3>,
     /// share of the tip's memory that has relaxed, 0 … 1
     relaxed: f64,
+    /// σ of the friction springs, see `axial`
+    softened: f64,
     /// friction given out last [N]
     friction_n: f64,
     faults: Faults,
@@ -93,7 +98,7 @@ impl NeedleTool {
         Ok(Self {
             rod: Rod::with_rest(c.rod, room + 2, curvature)?,
             path,
-            table,
+            table: table.no_stiffer_than(axial::TIP_SHARE * c.device_n_per_mm, c.max_force_n),
             world: Vec::with_capacity(room),
             arc: Vec::with_capacity(room),
             position: V3::zeros(),
@@ -102,10 +107,12 @@ impl NeedleTool {
             reference: V3::zeros(),
             inserted_mm: None,
             ahead_mm: 0.0,
+            carried: None,
             relaxed: 0.0,
+            softened: 1.0,
             friction_n: 0.0,
             faults: Faults::default(),
-            config,
+            config: NeedleConfig { grip_n_per_mm: c.grip_n_per_mm.min(c.device_n_per_mm), ..config },
         })
     }
 
@@ -210,6 +217,7 @@ impl NeedleTool {
         let axis = self.rod.tip_tangent();
         let inserted = if held { length - (self.position - skin).norm() } else { self.arc_of_tip() + self.ahead_mm };
         let forward = inserted - self.inserted_mm.unwrap_or(inserted);
+        self.soften();
         self.rub(forward);
         let tip = self.path.nodes()[self.path.nodes().len() - 1].reference;
         // eq. 3, with the exact gradient in place of differences over 1 mm
@@ -240,8 +248,10 @@ impl NeedleTool {
         // proxies of the nodes that are there now
         let skin = self.carry(inputs.breathing);
         self.store_arcs();
+        self.soften();
         self.inserted_mm = Some(if held { length - (self.position - skin).norm() } else { self.arc_of_tip() + ahead });
         let (cutting, friction) = self.axial(dt);
+        self.go_along(held);
         out.solved = self.solve(held, dt);
         self.faults.unconverged += u64::from(!out.solved.converged);
         if !held {

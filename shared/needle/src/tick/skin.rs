@@ -56,7 +56,7 @@ impl NeedleTool {
 
     /// The needle has left the patient.
     pub(super) fn leave(&mut self) {
-        (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed) = (None, 0.0, 0.0, 0.0);
+        (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed, self.carried) = (None, 0.0, 0.0, 0.0, None);
         self.arc.clear();
         self.world.clear();
         self.rod.lay(self.position, self.orientation);
