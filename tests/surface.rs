@@ -124,7 +124,7 @@ fn what_cannot_be_is_refused_with_a_sentence() {
         (&["--range=100:", "--seed", "-120,20,0", "-o", &mesh], 1, "outside"),
         (&["--iso", "100", "--per-voxel", "400", "-o", &mesh], 2, "points a voxel"),
         (&["--range=300:100", "-o", &mesh], 2, "lower end first"),
-        (&["--iso", "100", "--smooth", "4", "-o", &mesh], 2, "choose 1, 5, 7 or 9"),
+        (&["--iso", "100", "--smooth", "4", "-o", &mesh], 2, "a window of 1, 5, 7 or 9"),
         (&["--iso", "100"], 2, "required"),
     ];
     for (arguments, status, part) in cases {

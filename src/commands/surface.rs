@@ -1,8 +1,10 @@
 //! `maille surface`: the surface of a level set, a range or an organ as a mesh file; organs as labels and volumes.
 
 use super::{Failure, Outcome};
-use maille_surface::{Border, Mesh, Organ, Selection, decimate, marching_cubes_bricks, marching_cubes_vif, organ};
-use maille_vif::{Octree, Options, Tolerance, Voxels, Window};
+use maille_surface::{
+    Border, Mesh, Organ, ResolutionError, Selection, decimate, marching_cubes_bricks, marching_cubes_patches, marching_cubes_vif, organ,
+};
+use maille_vif::{Lattice, Octree, Options, Tolerance, Voxels, Window};
 use maille_volume::{BrickSource, BrickedVolume, Volume, io::write_volume};
 use serde_json::{Map, Value, json};
 use std::{
@@ -51,9 +53,10 @@ pub struct Args {
     /// Close the surface where it meets the volume's border, half a voxel beyond the outermost voxel centres
     #[arg(long)]
     close: bool,
-    /// Smooth by least-squares fits in a window of 5, 7 or 9 voxels; 1 interpolates without smoothing
-    #[arg(long, value_name = "VOXELS", num_args = 0..=1, default_missing_value = "5", value_parser = window)]
-    smooth: Option<Window>,
+    /// Smooth by least-squares fits: `patch` puts every vertex on the bi-cubic patch around it, which takes noise off and keeps curved surfaces where they
+    /// are; 5, 7 or 9 fit in a window of so many voxels, 1 interpolates without smoothing
+    #[arg(long, value_name = "HOW", num_args = 0..=1, default_missing_value = "patch", value_parser = smooth)]
+    smooth: Option<Smooth>,
     /// Lattice points a voxel along each axis, above or below 1
     #[arg(long, value_name = "N", value_parser = positive)]
     per_voxel: Option<f64>,
@@ -66,6 +69,22 @@ pub struct Args {
     /// Print one JSON object
     #[arg(long)]
     json: bool,
+}
+
+/// How the smooth surface is made.
+#[derive(Clone, Copy)]
+enum Smooth {
+    Patch,
+    Window(Window),
+}
+
+impl Smooth {
+    fn extract(self, lattice: &impl Lattice, iso: f64, per_voxel: f64, border: Border) -> Result<Mesh, ResolutionError> {
+        match self {
+            Self::Patch => marching_cubes_patches(lattice, iso, per_voxel, border),
+            Self::Window(window) => marching_cubes_vif(lattice, window, iso, per_voxel, border),
+        }
+    }
 }
 
 type Writer = fn(&Mesh, BufWriter<File>) -> io::Result<()>;
@@ -170,9 +189,10 @@ fn extract(
     if args.smooth.is_none() && args.per_voxel.is_none() && args.tolerance.is_none() {
         return Ok(marching_cubes_bricks(source, iso, border));
     }
-    let (window, per_voxel) = (args.smooth.unwrap_or(Window::One), args.per_voxel.unwrap_or(1.0));
+    let per_voxel = args.per_voxel.unwrap_or(1.0);
+    let how = args.smooth.unwrap_or(Smooth::Window(Window::One));
     let mesh = match args.tolerance {
-        None => marching_cubes_vif(&Voxels(source), window, iso, per_voxel, border),
+        None => how.extract(&Voxels(source), iso, per_voxel, border),
         Some(rms) => {
             let octree = Octree::build(source, Options { tolerance: Tolerance::Rms(rms), ..Options::default() })
                 .map_err(|error| Failure::Usage(error.to_string()))?;
@@ -189,7 +209,7 @@ fn extract(
                 "octree".into(),
                 json!({"cubics": cubics, "raw_blocks": size.raw_blocks, "raw_share": size.raw_share(), "bytes": size.bytes(), "ratio": size.ratio(), "rms": octree.rms_error()}),
             );
-            marching_cubes_vif(&octree, window, iso, per_voxel, border)
+            how.extract(&octree, iso, per_voxel, border)
         }
     };
     mesh.map_err(|error| Failure::Usage(error.to_string()))
@@ -248,13 +268,14 @@ fn range(text: &str) -> Result<[f64; 2], String> {
     if low <= high { Ok([low, high]) } else { Err(format!("the range {text} holds nothing: give the lower end first")) }
 }
 
-fn window(text: &str) -> Result<Window, String> {
+fn smooth(text: &str) -> Result<Smooth, String> {
     match text {
-        "1" => Ok(Window::One),
-        "5" => Ok(Window::Five),
-        "7" => Ok(Window::Seven),
-        "9" => Ok(Window::Nine),
-        _ => Err(format!("{text} is not a window: choose 1, 5, 7 or 9 voxels")),
+        "patch" => Ok(Smooth::Patch),
+        "1" => Ok(Smooth::Window(Window::One)),
+        "5" => Ok(Smooth::Window(Window::Five)),
+        "7" => Ok(Smooth::Window(Window::Seven)),
+        "9" => Ok(Smooth::Window(Window::Nine)),
+        _ => Err(format!("{text} is no way to smooth: choose patch, or a window of 1, 5, 7 or 9 voxels")),
     }
 }
 

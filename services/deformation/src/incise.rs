@@ -62,6 +62,15 @@ pub(crate) struct Changed {
     pub elements: u64,
 }
 
+impl Changed {
+    /// And what another changed.
+    pub fn add(&mut self, other: Self) {
+        self.region.merge(&other.region);
+        self.numbered.extend(other.numbered);
+        self.elements += other.elements;
+    }
+}
+
 /// Stroke n's number.
 fn number_of(stroke: u64) -> u8 {
     (stroke % UNDOABLE) as u8 + 1

@@ -2,10 +2,12 @@
 //!
 //! For each tool move: find where the tool met the surface, pin the elements there, let ChainMail give way, let the mapper
 //! rewrite voxels, and commit voxels, displacements and state in one transaction. Moves that arrive while it works are
-//! superseded by the newest. In a scene with incisions a move takes tissue away instead ([`incise`]), and the page takes it back. Everything the next step depends on is in the store, so a restarted process goes on as if
+//! superseded by the newest. In a scene with incisions moves take tissue away instead ([`incise`]): each of them does, those that waited together in one
+//! commit; and the page takes it back. Everything the next step depends on is in the store, so a restarted process goes on as if
 //! nothing had happened (DESIGN D3).
 //!
-//! It sleeps between polls ([`POLL`]); a push is answered within that and its own work.
+//! It sleeps between polls ([`POLL`]); a push is answered within that and its own work. Steps are counted from where their time came, not from when they were
+//! taken ([`Pace`]): otherwise each would come up to a poll later than the one before, and a scene at 100 Hz would step 90 times a second.
 
 #![forbid(unsafe_code)]
 
@@ -46,6 +48,8 @@ pub enum DeformationError {
 
 /// Sleep between looks at the queue: adds a millisecond on average to a push, costs under one per cent of a core.
 const POLL: Duration = Duration::from_millis(2);
+/// Most moves that are taken from the queue at a time; it holds fewer.
+const MOST_WAITING: usize = 64;
 /// Shortest time between relaxation steps, and how long no push may have come before the first [ns].
 const RELAX_NS: u64 = 33_000_000;
 
@@ -99,7 +103,8 @@ fn steps<W: Stopwatch>(
         announcer.standing(&life, writer.epoch());
     }
     let shortest_ns = (1e9 / scene.deformation.rate_hz) as u64;
-    let (mut last_step, mut refused_view) = (0u64, 0u64);
+    let (mut pace, mut refused_view) = (Pace::new(shortest_ns), 0u64);
+    let mut waiting = Vec::new();
     // only a scene whose accuracy is the governor's looks for what that turned
     let mut knobs_seen = (scene.accuracy == Accuracy::Auto).then_some(0u64);
     // only a scene that calls for something that can be switched looks whether it was
@@ -131,10 +136,10 @@ fn steps<W: Stopwatch>(
             announcer.published(&life, epoch);
         }
         // while too much waits to become visible (a stopped reader holds the slots) the tissue stands; the newest move stays queued
-        let due = now.saturating_sub(last_step) >= shortest_ns && writer.has_room();
+        let due = pace.is_due(now) && writer.has_room();
         if engine.cuts() && due {
             if let Some(done) = engine.cut(life.control().held_tool(now).as_ref(), reader, &mut writer) {
-                last_step = now;
+                pace.stepped(now);
                 announcer.step(&mut life, &done, now, None);
             }
             // a blade pushes nothing
@@ -144,21 +149,28 @@ fn steps<W: Stopwatch>(
             && let Some((command, _)) = life.control().undo.load::<UndoCommand>()
             && let Some(done) = engine.undo(command.undos, reader, &mut writer)
         {
-            last_step = now;
+            pace.stepped(now);
             announcer.step(&mut life, &done, now, None);
             continue;
         }
         if let Some(drag) = drag.as_mut().filter(|_| due)
             && let Some(done) = drag.follow(&mut engine, life.control(), now, reader, &mut writer)
         {
-            last_step = now;
+            pace.stepped(now);
             announcer.step(&mut life, &done, now, None);
         }
-        let Some(message) = due.then(|| moves.latest()).flatten() else {
+        waiting.clear();
+        if due && engine.incises() {
+            // bounded: who sends as fast as we receive must not hold us here
+            waiting.extend(std::iter::from_fn(|| moves.next()).take(MOST_WAITING));
+        } else if due {
+            waiting.extend(moves.latest());
+        }
+        if waiting.is_empty() {
             let tool = life.control().held_tool(now).filter(|tool| tool.flags & TOOL_IN_CONTACT != 0);
             let may = engine.respects_tools() || tool.is_none();
-            if due && engine.relaxes() && now.saturating_sub(last_step) >= RELAX_NS && may {
-                last_step = now;
+            if due && engine.relaxes() && now.saturating_sub(pace.last_ns) >= RELAX_NS && may {
+                pace.stepped(now);
                 let held: Vec<Capsule> =
                     tool.iter().map(|t| Capsule { a: t.tip_reference_mm, b: t.tip_reference_mm, radius_mm: t.radius_mm }).collect();
                 // a push is answered at once, and what has moved so far is shown while pictures are still fluid
@@ -170,18 +182,69 @@ fn steps<W: Stopwatch>(
             }
             std::thread::sleep(POLL);
             continue;
-        };
-        life.cell().count(Counter::Received, 1);
-        let Some(message) = message.checked() else {
-            life.cell().count(Counter::Refused, 1);
-            continue;
-        };
-        if engine.has_answered(&message) {
-            continue;
         }
-        last_step = now;
-        if let Some(done) = engine.step(&message, now, reader, &mut writer) {
-            announcer.step(&mut life, &done, now, Some(message.stamp.sequence));
+        life.cell().count(Counter::Received, waiting.len() as u64);
+        let told = waiting.len();
+        waiting.retain_mut(|message| message.checked().map(|checked| *message = checked).is_some());
+        life.cell().count(Counter::Refused, (told - waiting.len()) as u64);
+        waiting.retain(|message| !engine.has_answered(message));
+        let Some(newest) = waiting.last().copied() else { continue };
+        pace.stepped(now);
+        let done = match engine.incises() {
+            true => engine.incise(&waiting, now, reader, &mut writer),
+            false => engine.step(&newest, now, reader, &mut writer),
+        };
+        if let Some(done) = done {
+            announcer.step(&mut life, &done, now, Some(newest.stamp.sequence));
         }
+    }
+}
+
+/// When the next step may be taken.
+struct Pace {
+    shortest_ns: u64,
+    last_ns: u64,
+    next_ns: u64,
+}
+
+impl Pace {
+    fn new(shortest_ns: u64) -> Self {
+        Self { shortest_ns, last_ns: 0, next_ns: 0 }
+    }
+
+    fn is_due(&self, now_ns: u64) -> bool {
+        now_ns >= self.next_ns
+    }
+
+    /// A step was taken: the next comes a period after this one should have, or after now where that was missed by more.
+    fn stepped(&mut self, now_ns: u64) {
+        self.last_ns = now_ns;
+        let from_ns = if now_ns.saturating_sub(self.next_ns) < self.shortest_ns { self.next_ns } else { now_ns };
+        self.next_ns = from_ns + self.shortest_ns;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_are_as_many_as_the_scene_says_however_coarsely_one_looks() {
+        let mut pace = Pace::new(10_000_000);
+        // looks 2.06 ms apart
+        let taken = (0..4855u64)
+            .filter(|n| {
+                let now = 5_000_000_000 + n * 2_060_000;
+                let due = pace.is_due(now);
+                if due {
+                    pace.stepped(now);
+                }
+                due
+            })
+            .count();
+        assert!((999..=1001).contains(&taken), "{taken} steps in ten seconds");
+        // what was missed is not caught up
+        pace.stepped(60_000_000_000);
+        assert!(!pace.is_due(60_009_999_999) && pace.is_due(60_010_000_000));
     }
 }

@@ -249,13 +249,26 @@ impl<W: Stopwatch> Engine<W> {
         self.state.pushes > 0 && self.state.last_move == message.stamp
     }
 
-    /// Answers a tool move at `now_ns` by taking away what lies below the tip; `None` when nothing does.
-    pub fn incise(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
-        let State { strokes, threshold_hu, .. } = &mut self.state;
-        let changed = self.incisions.as_mut()?.cut(&reader.rest(), &mut self.mail, strokes, message, *threshold_hu, now_ns)?;
-        self.state.last_move = message.stamp;
+    /// Whether the tool takes tissue away: then every move counts, not only the newest.
+    pub fn incises(&self) -> bool {
+        self.incisions.is_some()
+    }
+
+    /// Answers tool moves at `now_ns`, the oldest first, by taking away what lay below the tip at each; `None` when nothing did.
+    pub fn incise(&mut self, messages: &[ToolMove], now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        self.watch.start();
+        let (incisions, rest, threshold_hu) = (self.incisions.as_mut()?, reader.rest(), self.state.threshold_hu);
+        let mut all: Option<Changed> = None;
+        for message in messages {
+            if let Some(changed) = incisions.cut(&rest, &mut self.mail, &mut self.state.strokes, message, threshold_hu, now_ns) {
+                all.get_or_insert_default().add(changed);
+                self.state.last_move = message.stamp;
+                self.state.pushes += 1;
+            }
+        }
+        let changed = all?;
         self.state.last_step_ns = now_ns;
-        self.state.pushes += 1;
+        self.watch.split("incision");
         Some(self.commit_incision(&changed, reader, writer))
     }
 
@@ -275,7 +288,11 @@ impl<W: Stopwatch> Engine<W> {
     /// Answers a tool move at `now_ns`, as the scene has it; `None` when there is nothing to do.
     pub fn step(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         self.watch.start();
-        if self.incisions.is_some() { self.incise(message, now_ns, reader, writer) } else { self.press(message, now_ns, reader, writer) }
+        if self.incises() {
+            self.incise(std::slice::from_ref(message), now_ns, reader, writer)
+        } else {
+            self.press(message, now_ns, reader, writer)
+        }
     }
 
     /// Answers a tool move by pushing; `None` when there is nothing to push.

@@ -1,7 +1,7 @@
 //! From the scene's tables to the contact engine's configuration.
 
 use maille_contact::{Coupling, CouplingError, DeviceProfile, HapticConfig, Limits, Material, TissueTable, ToolShape};
-use maille_scene::{Scene, Shape, Tissue, Tool};
+use maille_scene::{Scene, Shape, Tissue, Tool, ToolKind};
 
 /// Damping of a device of the Touch class [N·s/mm] (5 N·s/m, CHAI3D's table of devices): what the coupling may count on
 /// while no real device says otherwise.
@@ -30,6 +30,7 @@ pub(crate) fn config(scene: &Scene, tool: &Tool, device: Option<&DeviceProfile>)
         Shape::Probe => ToolShape::probe(PROBE_WIDTH_MM, PROBE_FACE_MM, tool.radius_mm),
     };
     config.period_s = period_s;
+    config.moves_always = tool.kind == ToolKind::Incision;
     config.tissue = table(&scene.tissues);
     let max_force_n = device.map_or(h.max_force_n, |device| h.max_force_n.min(device.max_force_n));
     config.limits = Limits { max_force_n, max_slew_n_per_s: h.max_slew_n_per_s, ramp_s: h.ramp_s, fade_s: h.fade_s };

@@ -69,6 +69,8 @@ pub struct HapticConfig {
     pub device_damping_n_s_per_mm: f64,
     /// the balls of the tool; as made by [`HapticConfig::new`], one of `radius_mm` at the tip
     pub shape: ToolShape,
+    /// tool moves are told at every interval while the tip presses, not only when it goes deeper: for a tool that takes tissue away
+    pub moves_always: bool,
     /// the point that the device holds, in the tool's frame [mm]: torque is about it
     pub handle_mm: [f64; 3],
     /// limits of the device's torque [N·mm, N·mm/s]; 0: it has none
@@ -97,6 +99,7 @@ impl HapticConfig {
             device_mass_kg: Port::default().mass_kg,
             device_damping_n_s_per_mm: 0.0,
             shape: ToolShape::sphere(radius_mm),
+            moves_always: false,
             handle_mm: [0.0; 3],
             max_torque_n_mm: 0.0,
             max_torque_slew_n_mm_per_s: 0.0,
@@ -525,7 +528,7 @@ impl HapticCore {
         out.normal = contact.normal;
         out.penetration_mm = contact.penetration_mm.max(0.0);
         let proxy = &self.nodes[n].proxy;
-        out.tool_move = self.gate.due(inputs.now_ns, contact.penetration_mm).map(|sequence| ToolMove {
+        out.tool_move = self.gate.due(inputs.now_ns, contact.penetration_mm, self.config.moves_always).map(|sequence| ToolMove {
             tip_mm: centre.into(),
             outside_mm: proxy.outside_mm().unwrap_or(contact.proxy_mm),
             contact_mm: contact.point_mm,

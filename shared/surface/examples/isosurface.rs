@@ -2,7 +2,7 @@
 //! two. `cargo run --release -p maille-surface --example isosurface -- VOLUME [ISO [FOLDER]]`, which then writes meshes; the peer is FlyingEdges with normals, two threads,
 //! on the same file.
 
-use maille_surface::{Border, Mesh, marching_cubes, marching_cubes_bricks, marching_cubes_vif, write_ply};
+use maille_surface::{Border, Mesh, marching_cubes, marching_cubes_bricks, marching_cubes_patches, marching_cubes_vif, write_ply};
 use maille_vif::{Voxels, Window};
 use maille_volume::{BrickedVolume, io::read_volume};
 use rustix::time::{ClockId, clock_gettime};
@@ -37,6 +37,8 @@ fn main() {
         times("bricks", || marching_cubes_bricks(&bricks, iso, Border::Open).triangles.len());
         let smooth = |per_voxel| marching_cubes_vif(&Voxels(&bricks), Window::Five, iso, per_voxel, Border::Open).expect("a resolution");
         times("smooth function", || smooth(1.0).triangles.len());
+        let patches = || marching_cubes_patches(&Voxels(&bricks), iso, 1.0, Border::Open).expect("a resolution");
+        times("patches", || patches().triangles.len());
         // for the eye: the voxels' mesh and the function's, at zoom
         if let Some(folder) = std::env::args().nth(3).map(PathBuf::from) {
             let write = |name: &str, mesh: &Mesh| {

@@ -6,11 +6,15 @@
 //! the bricks as on any volume's. At last every vertex is put where the function itself crosses its lattice edge, not its samples, and
 //! takes its normal from the function's gradient.
 //!
-//! Invariants: those of marching cubes; vertices stay on their lattice edges, so topology is that of the samples. The same bits on any
-//! number of threads. Cost: some 10 µs a brick passed and 0.2 µs a vertex. Memory: 14 KiB a brick passed, and the mesh.
+//! **On patches** ([`marching_cubes_patches`]) every vertex then goes on to the least-squares bi-cubic patch around it [Shimizu & Nakamura, eq. 6 and 7], on a
+//! spline that smooths little itself. Noise is averaged along the surface, over 25 crossings, and not across it: a window that takes as much
+//! noise off across a blurred edge draws curved surfaces inwards, by more than the noise was.
+//!
+//! Invariants: those of marching cubes; topology is that of the samples: vertices stay on their lattice edges, or within [`FARTHEST`] of them on patches. The same
+//! bits on any number of threads. Cost: some 10 µs a brick passed and 0.2 µs a vertex, 6 µs on patches. Memory: 14 KiB a brick passed, and the mesh.
 
 use crate::{Border, Mesh, marching_cubes_bricks};
-use maille_vif::{Lattice, Spline, Window};
+use maille_vif::{Lattice, LocalSurface, Spline, Window};
 use maille_volume::{
     Brick, BrickId, BrickLayout, BrickSource, Grid, Rescale, VolumeInfo,
     brick::{APRON_LOW, EDGE, ROW, SLICE, STORED_EDGE},
@@ -20,6 +24,16 @@ use rayon::prelude::*;
 
 /// Samples are stored in this part of the volume's unit, so that their rounding is far below what noise does.
 const FINER: f64 = 1.0 / 16.0;
+/// Distance of a patch's lines [mean voxels]: further apart noise is less alike from one to the next, and curved surfaces are less bi-cubic; of 0.9 to 1.5
+/// this has the least error on balls of 6 and 13 voxels and a ring of 5 and 10, without noise and with 20 and 60 HU.
+const PATCH_STEP: f64 = 1.25;
+/// Crossings of 25 that a patch needs to be trusted.
+const ENOUGH: usize = 12;
+/// Furthest way of a vertex to its patch [voxels].
+const FARTHEST: f64 = 0.5;
+/// Voxels around a brick that patches at its vertices look at.
+const ROOM: isize = 6;
+
 /// Most lattice points along an axis.
 const LONGEST: usize = 8192;
 
@@ -48,6 +62,37 @@ pub fn marching_cubes_vif(
     per_voxel: f64,
     border: Border,
 ) -> Result<Mesh, ResolutionError> {
+    extract(lattice, window, iso, per_voxel, border, Finish::Function)
+}
+
+/// The same with every vertex, and its normal, on the bi-cubic patch around it: the surface that is nearest to the truth, noise or none.
+///
+/// # Errors
+/// When the resolution makes no sense.
+pub fn marching_cubes_patches(
+    lattice: &(impl Lattice + ?Sized),
+    iso: f64,
+    per_voxel: f64,
+    border: Border,
+) -> Result<Mesh, ResolutionError> {
+    extract(lattice, Window::Smoothing, iso, per_voxel, border, Finish::Patch)
+}
+
+/// Where vertices end.
+#[derive(Clone, Copy, PartialEq)]
+enum Finish {
+    Function,
+    Patch,
+}
+
+fn extract(
+    lattice: &(impl Lattice + ?Sized),
+    window: Window,
+    iso: f64,
+    per_voxel: f64,
+    border: Border,
+    finish: Finish,
+) -> Result<Mesh, ResolutionError> {
     if !(0.05..=16.0).contains(&per_voxel) {
         return Err(ResolutionError::Resolution(per_voxel));
     }
@@ -62,7 +107,7 @@ pub fn marching_cubes_vif(
     let grid = Grid { size, spacing: coarse.spacing.map(|s| s / per_voxel), ..coarse.clone() };
     let samples = Samples::new(lattice, window, iso, per_voxel, grid);
     let mut mesh = marching_cubes_bricks(&samples, iso, border);
-    samples.settle(lattice, window, iso, per_voxel, &mut mesh);
+    samples.settle(lattice, window, iso, per_voxel, finish, &mut mesh);
     Ok(mesh)
 }
 
@@ -132,8 +177,8 @@ impl Samples {
         Self { info: VolumeInfo { grid, rescale }, layout, slot, bricks }
     }
 
-    /// Puts every vertex where the function crosses its lattice edge, and gives it the function's normal.
-    fn settle(&self, lattice: &(impl Lattice + ?Sized), window: Window, iso: f64, per_voxel: f64, mesh: &mut Mesh) {
+    /// Puts every vertex where the function crosses its lattice edge, or on the patch around that place, and gives it its normal.
+    fn settle(&self, lattice: &(impl Lattice + ?Sized), window: Window, iso: f64, per_voxel: f64, finish: Finish, mesh: &mut Mesh) {
         let grid = &self.info.grid;
         let (to_index, to_world) = (grid.index_from_world_matrix(), grid.world_from_index_matrix());
         let origin = Vector3::from(grid.origin);
@@ -152,7 +197,10 @@ impl Samples {
                 of_brick[id as usize].push(n as u32);
             }
         }
-        let turn = lattice.info().grid.index_from_world_matrix().transpose();
+        let coarse = &lattice.info().grid;
+        let turn = coarse.index_from_world_matrix().transpose();
+        let step_mm = PATCH_STEP * coarse.spacing.iter().product::<f64>().cbrt();
+        let room = if finish == Finish::Patch { ROOM } else { 0 };
         let settled: Vec<Vec<([f32; 3], [f32; 3])>> = of_brick
             .par_iter()
             .enumerate()
@@ -161,7 +209,8 @@ impl Samples {
                     return Vec::new();
                 }
                 let first = self.layout.first_voxel(id as BrickId).map(|v| v as isize - APRON_LOW as isize);
-                load(lattice, window, per_voxel, first, spline);
+                let (low, extent) = voxels_of(per_voxel, first);
+                spline.load(lattice, window, low.map(|v| v - room), extent.map(|v| v + 2 * room as usize));
                 let settle = |&n: &u32| {
                     let (old, normal) = (&mesh.positions[n as usize], &mesh.normals[n as usize]);
                     let mut at = index(old);
@@ -179,6 +228,14 @@ impl Samples {
                             break;
                         }
                         at[axis] = (at[axis] + step).clamp(low, high);
+                    }
+                    if finish == Finish::Patch
+                        && let Ok(patch) = LocalSurface::find(spline, coarse, iso, (at / per_voxel).into(), step_mm)
+                        && patch.found >= ENOUGH
+                        && (Vector3::from(patch.point) - at / per_voxel).amax() < FARTHEST
+                    {
+                        let point = coarse.world_from_index(patch.point);
+                        return (point.map(|v| v as f32), patch.world_normal(coarse).map(|v| v as f32));
                     }
                     let normal = match (turn * -gradient).try_normalize(1e-12) {
                         Some(n) => n.map(|v| v as f32).into(),
@@ -203,11 +260,6 @@ fn voxels_of(per_voxel: f64, first: [isize; 3]) -> ([isize; 3], [usize; 3]) {
     let low = first.map(|v| (v as f64 / per_voxel).floor() as isize - 1);
     let high = first.map(|v| ((v + STORED_EDGE as isize - 1) as f64 / per_voxel).floor() as isize + 3);
     (low, std::array::from_fn(|c| (high[c] - low[c]) as usize))
-}
-
-fn load(lattice: &(impl Lattice + ?Sized), window: Window, per_voxel: f64, first: [isize; 3], spline: &mut Spline) {
-    let (low, extent) = voxels_of(per_voxel, first);
-    spline.load(lattice, window, low, extent);
 }
 
 #[allow(clippy::too_many_arguments)] // all of them differ from brick to brick or are scratch

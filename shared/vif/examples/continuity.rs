@@ -2,10 +2,13 @@
 //! continuous layer; and what the continuous layer and the local surface cost there. `cargo run --release -p maille-vif --example continuity
 //! [-- FOLDER-OF-DATA]`.
 //!
+//! The cost is told twice: at places all over the head, each with a neighbourhood that is new and not in the processor's cache; and tick by tick along ways over the
+//! surface, as a tip goes that slides 100 mm/s, with its neighbourhood loaded again where it has left the middle.
+//!
 //! Points lie on faces between blocks of different leaves, where the isosurface passes within half a voxel. Step: difference of the two
 //! sides' values over the gradient, in voxels. Turn: angle between the two sides' gradients.
 
-use maille_vif::{LocalSurface, Octree, Options, Spline, Voxels, Window, paper_surface};
+use maille_vif::{LocalSurface, Neighbourhood, Octree, Options, Spline, Voxels, Window, paper_surface};
 use maille_volume::{BrickSource, BrickedVolume, io::read_volume};
 use nalgebra::Vector3;
 use std::{path::PathBuf, time::Instant};
@@ -89,11 +92,46 @@ fn main() {
             part += usize::from(surface.is_ok_and(|s| s.found < 25));
             paper_missing += usize::from(by_paper.is_err());
         }
+        println!("  at new places:");
         quantiles("load of a neighbourhood (12³ coefficients)", "µs", &mut load);
         quantiles("local surface in it", "µs", &mut patch);
         quantiles("both", "µs", &mut all);
         quantiles("the paper's border following", "µs", &mut paper);
         quantiles("value and gradient of the layer", "µs", &mut sample);
         println!("  of 5000: no patch {missing}, fewer than 25 points {part}; by the paper's 26 directions no patch {paper_missing}");
+        slide(&bricks, iso, &starts);
     }
+}
+
+/// Ticks of a tip that slides over the surface from each start: follow, patch, and both.
+fn slide(bricks: &BrickedVolume, iso: f64, starts: &[[f64; 3]]) {
+    let grid = &bricks.info().grid;
+    let mut near = Neighbourhood::new(bricks, Window::Five, 1.2 * 1.5 + grid.min_spacing()).expect("a small tip");
+    let (mut loads, mut patches, mut ticks) = (Vec::new(), Vec::new(), Vec::new());
+    for start in starts.iter().step_by(starts.len() / 400) {
+        let mut at = *start;
+        // a tip comes to its place through the air: there the neighbourhood is loaded and no patch is asked for
+        near.follow(bricks, 1, at);
+        for _ in 0..120 {
+            let begin = Instant::now();
+            let loaded = near.follow(bricks, 1, at);
+            let followed = begin.elapsed();
+            let surface = LocalSurface::find(near.spline(), grid, iso, at, 1.5 * grid.min_spacing());
+            let all = begin.elapsed();
+            if loaded {
+                loads.push(followed.as_secs_f64() * 1e6);
+            }
+            patches.push((all - followed).as_secs_f64() * 1e6);
+            ticks.push(all.as_secs_f64() * 1e6);
+            let Ok(surface) = surface else { break };
+            // a tenth of a millimetre on, across the normal
+            let across = Vector3::from(surface.normal).cross(&Vector3::new(0.36, 0.48, 0.8));
+            let Some(step) = across.try_normalize(1e-6) else { break };
+            at = std::array::from_fn(|c| surface.point[c] + 0.1 * step[c] / grid.spacing[c]);
+        }
+    }
+    println!("  along ways over the surface, {} ticks, {} loads:", ticks.len(), loads.len());
+    quantiles("load, where there was one", "µs", &mut loads);
+    quantiles("local surface", "µs", &mut patches);
+    quantiles("both, tick by tick", "µs", &mut ticks);
 }

@@ -12,7 +12,7 @@
 //! and 6) and puts a point on every crack by linear interpolation (eq. 5). Made for round heads: kept as the reference.
 //!
 //! Units: start and point are continuous indices; steps mm; normals are unit vectors along the grid's axes, in mm, pointing to lower values
-//! ([`LocalSurface::world_normal`] turns them to the patient's). Cost: 25 points, about 60 samples. Allocation: none when all points are found.
+//! ([`LocalSurface::world_normal`] turns them to the patient's). Cost: 25 points, about 60 samples. Allocation: none.
 
 use crate::{
     bicubic::{Bicubic, LINES, REACH},
