@@ -3,7 +3,7 @@
 //! A move is told when the tip is deeper than [`MIN_DEPTH_MM`] in the tissue *as it is now*, at most every [`MIN_INTERVAL_NS`],
 //! and only when the depth has grown by [`MIN_DEPTH_MM`] since it was last told or since the tissue gave way. While the tip
 //! stays in, it is told again every [`REPEAT_NS`], so that a restarted deformation learns of it. A tool that takes tissue away is told
-//! of at every interval while it presses: it moves on through what it cut, no deeper than before. Intervals are counted from where they should have ended, so that
+//! of at every interval while it presses: it moves on through what it cut, no deeper than before. Its intervals are counted from where they should have ended, so that
 //! late ticks do not add up. Allocation: none.
 
 /// Depth, and growth of depth, that is worth a deformation [mm].
@@ -57,7 +57,7 @@ impl MoveGate {
             return None;
         }
         self.last_ns = Some(now_ns);
-        self.next_ns = if now_ns - self.next_ns < MIN_INTERVAL_NS { self.next_ns } else { now_ns } + MIN_INTERVAL_NS;
+        self.next_ns = if always && now_ns - self.next_ns < MIN_INTERVAL_NS { self.next_ns } else { now_ns } + MIN_INTERVAL_NS;
         self.base_mm = depth_mm;
         self.sequence += 1;
         Some(self.sequence)
