@@ -43,7 +43,20 @@ enum Command {
     Clean(commands::clean::Args),
 }
 
+/// Who reads may stop reading (`maille info FILE | head`): the command ends there, as others do when told so by a signal, and says nothing.
+fn end_with_the_reader() {
+    let usual = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        let said = info.payload().downcast_ref::<String>();
+        if said.is_some_and(|said| said.starts_with("failed printing to stdout") && said.contains("Broken pipe")) {
+            std::process::exit(141);
+        }
+        usual(info);
+    }));
+}
+
 fn main() -> ExitCode {
+    end_with_the_reader();
     let command = CommandLine::parse().command.unwrap_or_else(|| Command::Run(commands::run::Args::default()));
     let outcome = match command {
         Command::Run(args) => commands::run::run(&args),
