@@ -137,6 +137,10 @@ fn the_page_lives_obeys_and_survives_a_killed_rendering() {
     // the surface at the threshold, moved by dragging the slider from skin to bone
     click(&mut browser, "mode-surface");
     frames(&mut browser, 6);
+    // a page has no button for what its scene does not call for
+    let shown = browser.evaluate("[...document.querySelectorAll('[hidden]')].filter((e) => e.offsetParent !== null).map((e) => e.id)");
+    assert_eq!(shown, serde_json::json!([]), "hidden, and seen");
+    assert_eq!(browser.evaluate("document.getElementById('undo').offsetParent === null"), true);
     browser.evaluate("window.skin = grey('3d'); true");
     frames(&mut browser, 6);
     let by_itself = number(browser.evaluate("changed(skin, grey('3d'))"));
