@@ -14,7 +14,8 @@ mod service;
 
 use device::{drive, norm, steps};
 use maille_contact::Grip;
-use maille_contract::{Role, ServiceState, ToolState, messages::TOOL_FADING};
+use maille_contract::messages::{DEVICE_VALID, DeviceForce, DeviceState, TOOL_FADING};
+use maille_contract::{Role, ServiceState, ToolState};
 use maille_scene::{BoxMm, Scene};
 use maille_store::{FREE_PINS, Reader};
 use maille_transport::{ControlMap, Domain, monotonic_ns};
@@ -253,10 +254,84 @@ fn a_device_that_is_unplugged_in_mid_run_fades_and_comes_back() {
     eventually("the run goes on without the device", || tool(&control).stamp.sequence > before + 200);
     assert_eq!(tool(&control).force_n, [0.0; 3], "and without a force");
     assert_eq!(control.service(Role::Haptic).restarts.load(Relaxed), 0);
+    let told = |what: &str| run.printed().lines().filter(|line| line.contains(what)).count();
+    eventually("that it is lost is told", || told("it is looked for ten times a second") == 1);
 
     service.plug(true);
     assert!(press(), "it comes back: {:?}\n{}", tool(&control), run.printed());
+    eventually("that it is back is told", || told("is there; its force rises over 0.5 s") == 1);
+    assert_eq!(told("it is looked for ten times a second"), 1, "and all of it once: {}", run.printed());
     drop(control);
     ended(run, &domain);
     eventually("what is let go gets no force", || service.force_n() == [0.0; 3]);
+}
+
+/// A device in another process that sends what none may send: the force stays bounded, each kind of fault is an event in log and report, and the hand is back
+/// afterwards. Then the run ends in mid-press with a fade of 10 s: there is no force when the haptic process is gone.
+#[test]
+fn rubbish_from_a_device_is_logged_and_recovered_from_and_no_force_outlives_the_run() {
+    let scratch = Scratch::new("haptic-rubbish");
+    let report_path = scratch.file("run.json");
+    let more = ["--report", report_path.to_str().expect("a path")];
+    let (mut run, domain, control) = started(&scratch, &pressing("external", "[haptic]\nfade_s = 10.0\nmax_slew_n_per_s = 20.0\n"), &more);
+    let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
+    let scene = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
+    let rest = reader.rest();
+    let sampler = Sampler::new(&rest);
+    let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let start = way.at(0.0);
+    // into the tissue, along the way's own direction, as far as its deepest point
+    let deepest = way.at(0.85).position_mm;
+    let say = |at: [f64; 3], measured_ns: u64| {
+        let flags = DEVICE_VALID;
+        control.device.store(&DeviceState { measured_ns, flags, position_mm: at, direction: start.direction, velocity_mm_s: [0.0; 3] });
+    };
+    let mut largest = 0.0f64;
+    // presses slowly until the tool is felt, and in what the tool has dented out and in again
+    let mut press = |wanted_n: f64| {
+        for n in 0..20_000u64 {
+            let s = 0.5 - 0.5 * (n as f64 / 700.0 * std::f64::consts::PI).cos();
+            say(std::array::from_fn(|c| start.position_mm[c] + s * (deepest[c] - start.position_mm[c])), monotonic_ns());
+            std::thread::sleep(Duration::from_millis(1));
+            let force = norm(tool(&control).force_n);
+            largest = largest.max(force);
+            if force > wanted_n {
+                return true;
+            }
+        }
+        false
+    };
+    assert!(press(0.2), "tissue is felt: {:?}\n{}", tool(&control), run.printed());
+    let here = tool(&control).tip_mm;
+    for n in 0..300u64 {
+        let now = monotonic_ns();
+        match n % 4 {
+            0 => say([f64::NAN; 3], now),
+            1 => say([f64::INFINITY, 0.0, 0.0], now),
+            2 => say([here[0] + if n % 8 == 2 { 100.0 } else { 0.0 }, here[1], here[2]], now),
+            _ => say(here, now - 5_000_000),
+        }
+        std::thread::sleep(Duration::from_millis(2));
+        let force = tool(&control).force_n;
+        assert!(force.iter().all(|f| f.is_finite()) && norm(force) <= scene.haptic.max_force_n + 1e-9, "{force:?}");
+    }
+    assert!(press(0.2), "the hand is back: {:?}\n{}", tool(&control), run.printed());
+    signal(run.pid(), Signal::TERM);
+    // the hand stays where it is: what the process gives at last is what the device keeps until its own watchdog
+    assert!(run.wait().success(), "{}", run.printed());
+    let told: Option<DeviceForce> = control.device_force.load().map(|(told, _)| told);
+    assert_eq!(told.expect("it was told something").force_n, [0.0; 3], "no force outlives the process");
+    let report = report(&report_path);
+    assert_eq!(report["services"]["haptic"]["killed"], false);
+    let printed = run.printed();
+    for kind in ["jumps", "invalid_poses", "time_backwards"] {
+        let counted = report["services"]["haptic"]["faults"][kind].as_u64().expect("a count");
+        let events: Vec<_> = report["events"].as_array().expect("events").iter().filter(|e| e["kind"] == kind).collect();
+        let told: u64 = events.iter().map(|e| e["count"].as_u64().expect("a count")).sum();
+        println!("{kind}: {counted} counted, told in {} events", events.len());
+        assert!(counted > 10 && told == counted && events.len() < 20, "{kind}: {report:#}\n{printed}");
+    }
+    assert!(printed.contains("jumps of the device") && printed.contains("time went backwards"), "{printed}");
+    drop((reader, control));
+    assert_eq!(left_over(domain.name()), [""; 0]);
 }

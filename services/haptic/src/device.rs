@@ -38,7 +38,7 @@ pub(crate) fn open(kind: Kind, mut options: Options, scene: &Scene, way: &Waypoi
     if scene.device.origin_mm.is_none() {
         options.mounting.origin_mm = way.at(0.0).position_mm;
     }
-    Ok(maille_device::open(kind, &options)?)
+    Ok(maille_device::open_telling(kind, &options, |sentence| eprintln!("maille-haptic: {sentence}"))?)
 }
 
 #[cfg(test)]

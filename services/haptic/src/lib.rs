@@ -50,8 +50,9 @@ pub enum HapticError {
     Thread(std::io::Error),
 }
 
-/// Longest time given to the force to fade when the run ends [ns].
-const LEAVE_NS: u64 = 400_000_000;
+/// Longest time given to the force to fade when the run ends [ns]: whatever the scene's fade, on leaving it is 0.25 s at most and as fast as 0.1 N a
+/// tick allows (`maille_contact::shaper`), so that up to 50 N are gone before the process is. The supervisor waits for 1 s.
+const LEAVE_NS: u64 = 800_000_000;
 
 /// Runs the loop until the run ends.
 ///

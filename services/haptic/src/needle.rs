@@ -11,7 +11,8 @@
 
 use crate::HapticError;
 use crate::needle_port::NeedlePort;
-use maille_contact::{Coupling, DevicePose, DeviceProfile, ForceShaper, Limits, TickOutputs};
+use maille_contact::shaper::{LEAVE_FADE_S, LEAVE_SLEW_N_PER_S};
+use maille_contact::{Coupling, DevicePose, DeviceProfile, Faults, ForceShaper, Limits, TickOutputs};
 use maille_contract::ControlBlock;
 use maille_contract::needle::{
     LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag,
@@ -197,6 +198,10 @@ impl NeedleStage {
         let fading = moment.release || !moment.pose.valid || moment.pose_age_s.is_nan() || moment.pose_age_s > MAX_POSE_AGE_S;
         // a late tick gets no larger a step
         let step = dt.min(2e-3);
+        if moment.release {
+            self.force.leave(LEAVE_SLEW_N_PER_S);
+            self.torque.leave(self.torque.limits().max_force_n / LEAVE_FADE_S);
+        }
         let force_n = self.force.shape(out.force_n, step, fading);
         let torque_n_mm = self.torque.shape(out.torque_n_mm, step, fading);
         self.ticks += 1;
@@ -221,7 +226,7 @@ impl NeedleStage {
             buried: false,
             fading,
             tool_move: None,
-            faults: Default::default(),
+            faults: Faults { jumps: out.faults.jumps, invalid_poses: out.faults.invalid_poses, ..Faults::default() },
         }
     }
 

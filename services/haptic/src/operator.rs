@@ -42,6 +42,9 @@ pub(crate) struct Operator {
     /// what is offset from the script while the page never held the tool
     pose: DevicePose,
     follow_script: bool,
+    /// when a device in another process measured last [ns], and how often that went backwards
+    measured_ns: u64,
+    backwards: u64,
 }
 
 impl Operator {
@@ -58,12 +61,17 @@ impl Operator {
             (Device::External, _) => Holder::External,
             _ => Holder::Script,
         };
-        Self { way, holder, page: None, back: None, pose, follow_script: tool.device != Device::Console }
+        Self { way, holder, page: None, back: None, pose, follow_script: tool.device != Device::Console, measured_ns: 0, backwards: 0 }
     }
 
     /// Whether a device in another process is held.
     pub fn is_external(&self) -> bool {
         matches!(self.holder, Holder::External)
+    }
+
+    /// How often the clock of a device in another process went backwards since the last call.
+    pub fn took_backwards(&mut self) -> u64 {
+        std::mem::take(&mut self.backwards)
     }
 
     /// Whether nobody holds the tool: it is the page's, and the page has let go.
@@ -99,6 +107,7 @@ impl Operator {
         let Some(said) = said.and_then(DeviceState::checked) else {
             return (DevicePose { valid: false, ..self.pose }, 0.0);
         };
+        self.backwards += u64::from(said.measured_ns < std::mem::replace(&mut self.measured_ns, said.measured_ns));
         // what was measured later than now has no age: it would never grow stale
         let from_the_future = said.measured_ns > monotonic_ns.saturating_add(AHEAD_NS);
         self.pose = DevicePose {

@@ -4,7 +4,7 @@ use crate::needle::{self, NeedleStage};
 use crate::operator::{Operator, simulated_profile};
 use crate::{HapticError, breath::Breather, device, outbox::Outbox, setup, smooth::SmoothStage};
 use maille_breathing::Patient;
-use maille_contact::{DevicePose, HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
+use maille_contact::{DevicePose, Faults, HapticCore, Isosurface, TickInputs, TickOutputs, moving::MovingTissue};
 use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
 use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
@@ -35,6 +35,8 @@ pub(crate) struct Loop<'a, W> {
     outbox: Arc<Outbox>,
     publisher: Thread,
     last: Option<TickOutputs>,
+    /// faults that others know of
+    told: Faults,
     /// the process that moves tissue is dead, starting, or silent
     tissue_stands: bool,
     refused: u64,
@@ -101,6 +103,7 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             outbox,
             publisher,
             last: None,
+            told: Faults::default(),
             tissue_stands: false,
             refused: 0,
             residual_mm: None,
@@ -309,7 +312,20 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             cell.count(Counter::InContact, u64::from(out.in_contact));
             cell.count(Counter::Degraded, u64::from(out.fading));
             cell.count(Counter::TissueStands, u64::from(self.tissue_stands));
+            let (now, told) = (out.faults, std::mem::replace(&mut self.told, out.faults));
+            for (counter, now, told) in [
+                (Counter::Jumps, now.jumps, told.jumps),
+                (Counter::InvalidPoses, now.invalid_poses, told.invalid_poses),
+                (Counter::StalePoses, now.stale_poses, told.stale_poses),
+                (Counter::TimeBackwards, now.time_backwards, told.time_backwards),
+                (Counter::Pauses, now.pauses, told.pauses),
+                (Counter::LostContacts, now.lost_contacts, told.lost_contacts),
+                (Counter::AbsurdForces, now.absurd_forces, told.absurd_forces),
+            ] {
+                cell.count(counter, now.saturating_sub(told));
+            }
         }
+        cell.count(Counter::TimeBackwards, self.operator.took_backwards());
         cell.count(Counter::Refused, std::mem::take(&mut self.refused));
     }
 }

@@ -22,6 +22,7 @@
 pub mod doctor;
 pub mod enter;
 mod error;
+pub mod events;
 pub mod fronts;
 pub mod governor;
 pub mod labels;

@@ -20,6 +20,8 @@
 //! | `services.haptic.tick_histogram`, `lateness_histogram` | the same as pairs: up to so many µs (null: more than all), how many ticks |
 //! | `services.haptic.ticks`, `contact_share` | ticks after warm-up; part of them in contact |
 //! | `services.haptic.in_contact`, `degraded`, `tissue_stood`, `allocations`, `realtime` | ticks in contact; ticks with the force fading; ticks on tissue as last committed while deformation was away; allocations in ticks; whether real-time rights were had |
+//! | `services.haptic.faults` | what the contact counted, each with its declared answer: `jumps`, `invalid_poses`, `stale_poses`, `time_backwards`, `pauses` (above 20 ms), `lost_contacts`, `absurd_forces` |
+//! | `events` | what went wrong at the hand as it was logged: `time_s`, `service`, `kind`, `count` since the last of its kind, `total` (see `events.rs`) |
 //! | `services.haptic.inversion` | in a scene that breathes: `ticks` whose position was carried to the patient at rest, `failures` without a rest position (force faded), `residual_mm` of all: `p50`, `p99`, `p999`, `max` |
 //! | `services.deformation.commits`, `moved_elements` | transactions; elements moved, summed over them |
 //! | `services.deformation.step_us` | from a tool move to its commit |
@@ -36,7 +38,7 @@
 //! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (at the end; null when the needle is out, `withdrawn`), `closest_to_target_mm` and `deepest_to_target_mm` (where the path was deepest) in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` and `residual_mm` of the rod in all `ticks_inside`, `ticks_slowed` and `ticks_unconverged` of them, `faults`, `port_energy_mj` and `port_energy_least_mj` (what the hand put in, less what it got back), `trace` (forces over time, see `trace.rs`; plotted beside the report), `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
-use crate::{governor::GovernorReport, memory::MIB, needle::NeedleReport, watch::Post};
+use crate::{events::Event, governor::GovernorReport, memory::MIB, needle::NeedleReport, watch::Post};
 use maille_contract::{
     ControlBlock, Role,
     control::{Counter, StageCell},
@@ -114,6 +116,19 @@ pub struct GpuReport {
     pub failures: u64,
 }
 
+/// What went wrong at the hand, in ticks or times.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct FaultReport {
+    pub jumps: u64,
+    pub invalid_poses: u64,
+    pub stale_poses: u64,
+    pub time_backwards: u64,
+    pub pauses: u64,
+    pub lost_contacts: u64,
+    pub absurd_forces: u64,
+}
+
 /// Of the haptic process.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -132,6 +147,7 @@ pub struct HapticReport {
     pub tissue_stood: u64,
     pub allocations: u64,
     pub realtime: bool,
+    pub faults: FaultReport,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub inversion: Option<InversionReport>,
     /// where a smooth surface is felt
@@ -229,6 +245,7 @@ pub struct RunReport {
     pub needle: Option<NeedleReport>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub governor: Option<GovernorReport>,
+    pub events: Vec<Event>,
 }
 
 impl ServiceReport {
@@ -273,6 +290,15 @@ fn own(role: Role, control: &ControlBlock) -> Own {
             tissue_stood: n(Counter::TissueStands),
             allocations: n(Counter::Allocations),
             realtime: n(Counter::NotRealtime) == 0,
+            faults: FaultReport {
+                jumps: n(Counter::Jumps),
+                invalid_poses: n(Counter::InvalidPoses),
+                stale_poses: n(Counter::StalePoses),
+                time_backwards: n(Counter::TimeBackwards),
+                pauses: n(Counter::Pauses),
+                lost_contacts: n(Counter::LostContacts),
+                absurd_forces: n(Counter::AbsurdForces),
+            },
             // nanometres in place of nanoseconds
             inversion: breathes(&control.inversion, n(Counter::Unmapped)).map(|ticks| InversionReport {
                 ticks,

@@ -6,12 +6,14 @@
 
 use crate::{
     SupervisorError,
+    events::Events,
     fronts::Fronts,
     governor::Pilot,
     labels, memory,
     needle::NeedleReport,
     patient::{Patient, Progress},
     report::{RunReport, ServiceReport, StoreReport},
+    say,
     trace::Tracer,
     watch::{Post, Watch, end_all},
 };
@@ -55,6 +57,7 @@ pub struct Simulation {
     stages: [Vec<&'static str>; Role::ALL.len()],
     /// with `accuracy = "auto"`
     pilot: Option<Pilot>,
+    events: Events,
     started_ns: u64,
     killed: Vec<Role>,
     /// in a scene with a needle
@@ -132,6 +135,7 @@ impl Simulation {
             stages: Role::ALL
                 .map(|r| plan.processes.iter().find(|p| role(p.process) == Some(r)).map_or(Vec::new(), |p| plan.stage_names(p.process))),
             pilot: None,
+            events: Events::new(monotonic_ns()),
             started_ns: monotonic_ns(),
             killed: Vec::new(),
             tracer: None,
@@ -147,6 +151,7 @@ impl Simulation {
     /// Sets simulation time going and lets services run.
     pub fn begin(&mut self) {
         self.started_ns = monotonic_ns();
+        self.events = Events::new(self.started_ns);
         self.control.set_clock(&SimulationClock { origin_ns: self.started_ns, base_ns: 0, rate_ppm: REAL_TIME_PPM });
         self.control.supervisor_heartbeat_ns.store(self.started_ns, Relaxed);
         self.control.set_run_state(RunState::Running);
@@ -163,7 +168,7 @@ impl Simulation {
             self.node.clean_dead_nodes();
         };
         let watch = Watch { domain: self.domain.0.name(), control: &self.control, clean_dead_nodes: &clean };
-        watch.run(&mut self.posts, self.pilot.as_mut(), signals, duration)
+        watch.run(&mut self.posts, self.pilot.as_mut(), &mut self.events, signals, duration)
     }
 
     /// Where the scene leaves its accuracy to the governor: gives it one, with these fronts.
@@ -177,6 +182,9 @@ impl Simulation {
         self.posts.iter_mut().for_each(Post::sample_memory);
         let segments = memory::segments(self.domain());
         self.end_processes();
+        for event in self.events.look(&self.control, monotonic_ns(), true) {
+            say!("{event}");
+        }
         let filled = self
             .posts
             .iter()
@@ -196,6 +204,7 @@ impl Simulation {
             services,
             needle: NeedleReport::of(&self.scene, &self.control, self.tracer.take().map(Tracer::end)),
             governor: self.pilot.as_ref().map(Pilot::report),
+            events: self.events.log().to_vec(),
             store: StoreReport::of(
                 self.info.grid.voxel_count(),
                 &segments,

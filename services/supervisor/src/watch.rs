@@ -10,6 +10,7 @@
 
 use crate::{
     SupervisorError,
+    events::Events,
     governor::Pilot,
     memory,
     process::Process,
@@ -105,6 +106,7 @@ impl Watch<'_> {
         &self,
         posts: &mut [Post],
         mut pilot: Option<&mut Pilot>,
+        events: &mut Events,
         signals: &mut Signals,
         duration: Option<Duration>,
     ) -> Result<&'static str, SupervisorError> {
@@ -133,6 +135,9 @@ impl Watch<'_> {
             }
             if let Some(turned) = pilot.as_mut().and_then(|pilot| pilot.look(self.control, now)) {
                 say!("governor     {turned}");
+            }
+            for event in events.look(self.control, now, false) {
+                say!("{event}");
             }
             if now >= memory_due {
                 posts.iter_mut().for_each(Post::sample_memory);

@@ -21,7 +21,7 @@ use crate::{
     passivity::{Passivity, Port},
     proxy::Contact,
     shape::ToolShape,
-    shaper::{ForceShaper, Limits},
+    shaper::{ForceShaper, LEAVE_FADE_S, LEAVE_SLEW_N_PER_S, Limits},
     surface::Surface,
     toolmove::{MoveGate, ToolMove},
 };
@@ -151,7 +151,7 @@ pub struct TickInputs<'a, S: Surface + ?Sized> {
     pub epoch: u64,
     /// since when nothing was heard of the tissue's owner [s]; 0 when that does not matter
     pub tissue_age_s: f64,
-    /// the end was asked for: fade to zero
+    /// the end was asked for: fade to zero, in time ([`ForceShaper::leave`]); not to be taken back
     pub release: bool,
 }
 
@@ -356,6 +356,10 @@ impl HapticCore {
         }
         // a late tick gets no larger a step: what the hand would feel is one tick's change
         let step = dt.min(self.config.period_s);
+        if inputs.release {
+            self.shaper.leave(LEAVE_SLEW_N_PER_S);
+            self.torque_shaper.leave(self.config.max_torque_n_mm / LEAVE_FADE_S);
+        }
         let given = V3::from(self.shaper.last_n());
         out.force_n = self.shaper.shape(self.last_wanted.into(), step, fading);
         out.torque_n_mm = self.torque_shaper.shape(self.last_torque.into(), step, fading);

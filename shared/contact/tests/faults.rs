@@ -343,3 +343,39 @@ fn tools_of_several_balls_are_bounded_whatever_comes() {
         assert!(felt > 500, "it recovers each time: {felt} ticks felt");
     }
 }
+
+/// A process that leaves has no force left, however long the scene's fade and however low its slew limit; and it goes by 0.1 N a tick at most.
+#[test]
+fn on_leaving_the_force_is_gone_in_time_whatever_the_fade_and_the_slew_limit() {
+    let volume = ball();
+    let tissue = Isosurface::new(&volume, 0.0);
+    for (fade_s, max_slew_n_per_s, passivity) in [(10.0, 1.0, false), (10.0, 100.0, true), (0.1, 1.0, true), (0.05, 400.0, false)] {
+        let limits = maille_contact::Limits { max_force_n: MAX_FORCE_N, max_slew_n_per_s, ramp_s: 0.5, fade_s };
+        let mut core = HapticCore::new(HapticConfig { limits, passivity, ..config() });
+        let mut tick = |n: u64, release: bool| {
+            let at = V3::new(0.0, 0.0, (16.0 - 0.004 * n as f64).max(12.0));
+            let inputs = TickInputs {
+                now_ns: n * 1_000_000,
+                pose: pose(at),
+                pose_age_s: 0.0,
+                tissue: Some(&tissue),
+                epoch: 1,
+                tissue_age_s: 0.0,
+                release,
+            };
+            V3::from(core.tick(&inputs).force_n)
+        };
+        let mut last = V3::zeros();
+        (0..3000).for_each(|n| last = tick(n, false));
+        assert!(last.norm() > 0.2, "{last:?}");
+        let mut gone = None;
+        for n in 0..800 {
+            let force = tick(3000 + n, true);
+            assert!((force - last).norm() <= MAX_STEP_N.max(max_slew_n_per_s * 1e-3) + 1e-9, "{last:?} {force:?}");
+            last = force;
+            gone = gone.or((force == V3::zeros()).then_some(n));
+        }
+        assert!(gone.is_some_and(|n| n <= 400), "fade {fade_s} s, {max_slew_n_per_s} N/s: {gone:?}");
+        assert_eq!(last, V3::zeros(), "and stays away");
+    }
+}

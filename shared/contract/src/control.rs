@@ -19,7 +19,7 @@ use core::sync::atomic::{
 };
 
 /// "maille" and the version of this layout.
-pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille05");
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille06");
 /// Pins in the block.
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
@@ -125,10 +125,24 @@ pub enum Counter {
     SmoothLoads = 21,
     /// nanoseconds of `duration` in what knobs that turn live act on: the 3D view and its warp (rendering)
     KnobsNs = 22,
+    /// jumps of the device (haptic); this and the following are the contact's faults, each with its declared answer
+    Jumps = 23,
+    /// ticks with a pose that was not finite or not vouched for (haptic)
+    InvalidPoses = 24,
+    /// ticks with a pose that was too old (haptic)
+    StalePoses = 25,
+    /// times that the clock, or the device's own, went backwards (haptic)
+    TimeBackwards = 26,
+    /// ticks after a pause of more than 20 ms (haptic)
+    Pauses = 27,
+    /// contacts lost inside tissue (haptic)
+    LostContacts = 28,
+    /// forces of a contact that were none, or beyond what any device gives (haptic)
+    AbsurdForces = 29,
 }
 
 /// Number of counters.
-pub const COUNTERS: usize = 24;
+pub const COUNTERS: usize = 32;
 
 /// Stages of a service's loop that can be timed; the registry of effects names them, in the order of the plan.
 pub const STAGES: usize = 16;

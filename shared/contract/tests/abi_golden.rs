@@ -50,7 +50,7 @@ fn messages_keep_their_names_sizes_and_offsets() {
 
 #[test]
 fn shared_words_keep_their_sizes_and_offsets() {
-    golden!(ServiceCell, 18_944, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 240, lateness: 9_464, stages: 18_688);
+    golden!(ServiceCell, 19_008, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 304, lateness: 9_528, stages: 18_752);
     golden!(DeviceState, 88, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64);
     golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
     golden!(KnobState, 152, turns: 0, given_up: 8, turned: 16, values: 24);

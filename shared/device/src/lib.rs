@@ -111,10 +111,20 @@ pub fn profile(kind: Kind, options: &Options) -> DeviceProfile {
 /// # Errors
 /// When the vendor's library is missing or lacks a function, or a thread cannot be started. A device that is not plugged in is no error.
 pub fn open(kind: Kind, options: &Options) -> Result<RemoteDevice, DeviceError> {
+    open_telling(kind, options, |_| ())
+}
+
+/// The same; `tell` gets one sentence when the device is not there, is lost, is not ready, and when it is back.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_telling(kind: Kind, options: &Options, tell: impl Fn(&str) + Send + 'static) -> Result<RemoteDevice, DeviceError> {
     let profile = profile(kind, options);
     match kind {
-        Kind::Inverse3 => RemoteDevice::start(inverse3::Inverse3::new(options), profile, options.mounting),
-        Kind::Touch => RemoteDevice::start(touch::Touch::load(options)?, profile, options.mounting),
-        Kind::ForceDimension => RemoteDevice::start(forcedimension::ForceDimension::load(options)?, profile, options.mounting),
+        Kind::Inverse3 => RemoteDevice::start_telling(inverse3::Inverse3::new(options), profile, options.mounting, tell),
+        Kind::Touch => RemoteDevice::start_telling(touch::Touch::load(options)?, profile, options.mounting, tell),
+        Kind::ForceDimension => {
+            RemoteDevice::start_telling(forcedimension::ForceDimension::load(options)?, profile, options.mounting, tell)
+        }
     }
 }

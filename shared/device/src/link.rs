@@ -110,6 +110,19 @@ impl RemoteDevice {
     /// # Errors
     /// When the thread cannot be started.
     pub fn start(driver: impl Driver, profile: DeviceProfile, mounting: Mounting) -> Result<Self, DeviceError> {
+        Self::start_telling(driver, profile, mounting, |_| ())
+    }
+
+    /// The same; `tell` gets one sentence when the device is not there, is lost, is not ready, and when it is back. It is called on the device's thread.
+    ///
+    /// # Errors
+    /// When the thread cannot be started.
+    pub fn start_telling(
+        driver: impl Driver,
+        profile: DeviceProfile,
+        mounting: Mounting,
+        tell: impl Fn(&str) + Send + 'static,
+    ) -> Result<Self, DeviceError> {
         let shared = Arc::new(Shared {
             report: LatestCell::zeroed(),
             command: LatestCell::zeroed(),
@@ -119,7 +132,7 @@ impl RemoteDevice {
             exchanges: AtomicU64::new(0),
         });
         let for_thread = Arc::clone(&shared);
-        let thread = thread::Builder::new().name("device".into()).spawn(move || serve(driver, &for_thread, &profile))?;
+        let thread = thread::Builder::new().name("device".into()).spawn(move || serve(driver, &for_thread, &profile, &tell))?;
         Ok(Self { shared, profile, mounting, last: Report::zeroed(), seen: false, status: DeviceStatus::Unplugged, thread: Some(thread) })
     }
 
@@ -215,9 +228,45 @@ impl<D: Driver> Drop for Opened<'_, D> {
     }
 }
 
-fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile) {
+/// What was said last of a device, so that nothing is said twice.
+#[derive(Clone, Copy, PartialEq)]
+enum Said {
+    Nothing,
+    Away,
+    NotReady,
+    Ready,
+}
+
+impl Said {
+    /// The device cannot be had. A service that answers without its device is tried ten times a second: said once.
+    fn away(&mut self, error: &DeviceError, tell: &dyn Fn(&str)) {
+        if *self != Self::Away {
+            tell(&format!("{error}; it is looked for ten times a second, and the force is zero meanwhile"));
+            *self = Self::Away;
+        }
+    }
+
+    /// The device has spoken.
+    fn heard(&mut self, ready: bool, name: &str, tell: &dyn Fn(&str)) {
+        match (*self, ready) {
+            (Self::Away, true) => tell(&format!("the device ({name}) is there; its force rises over 0.5 s")),
+            (Self::NotReady, true) => tell(&format!("the device ({name}) is ready")),
+            (Self::Nothing | Self::Away | Self::Ready, false) => {
+                tell(&format!(
+                    "the device ({name}) is there but not ready: home or calibrate it, switch its power on; the force is zero meanwhile"
+                ));
+            }
+            _ => {}
+        }
+        *self = if ready { Self::Ready } else { Self::NotReady };
+    }
+}
+
+fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell: &dyn Fn(&str)) {
+    let mut said = Said::Nothing;
     while !shared.stop.load(Relaxed) {
-        if driver.open().is_err() {
+        if let Err(error) = driver.open() {
+            said.away(&error, tell);
             driver.close();
             thread::park_timeout(RETRY);
             continue;
@@ -227,11 +276,18 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile) {
         let opened = Opened(&mut driver, shared);
         while !shared.stop.load(Relaxed) {
             let command = || safe(shared.command.load::<Command>().map(|(command, _)| command), monotonic_ns(), began, profile);
-            let Ok(mut report) = opened.0.exchange(&command) else { break };
+            let mut report = match opened.0.exchange(&command) {
+                Ok(report) => report,
+                Err(error) => {
+                    said.away(&error, tell);
+                    break;
+                }
+            };
             report.taken_ns = monotonic_ns();
             if report.position_mm.iter().all(|v| v.is_finite()) {
                 shared.report.store(&report);
                 shared.connected.store(true, Relaxed);
+                said.heard(report.ready == 1, profile.name, tell);
             }
             shared.exchanges.fetch_add(1, Relaxed);
         }
@@ -261,6 +317,47 @@ fn safe(given: Option<Command>, now_ns: u64, opened_ns: u64, profile: &DevicePro
 mod tests {
     use super::*;
     use crate::profiles::TOUCH;
+
+    /// A device that is absent, comes, is not ready, is, goes and comes again, each for some exchanges.
+    struct Unsteady {
+        exchanges: u64,
+        opens: u64,
+    }
+
+    impl Driver for Unsteady {
+        fn open(&mut self) -> Result<(), DeviceError> {
+            self.opens += 1;
+            if self.opens <= 2 { Err(DeviceError::NotThere { device: "the toy", reason: "no cable".into() }) } else { Ok(()) }
+        }
+
+        fn exchange(&mut self, _: &dyn Fn() -> Command) -> Result<Report, DeviceError> {
+            thread::sleep(Duration::from_millis(1));
+            self.exchanges += 1;
+            match self.exchanges {
+                1..=10 => Ok(Report::zeroed()),
+                21..=23 => Err(DeviceError::Lost { device: "the toy", reason: "unplugged".into() }),
+                _ => Ok(Report { ready: 1, ..Report::zeroed() }),
+            }
+        }
+
+        fn close(&mut self) {}
+    }
+
+    #[test]
+    fn each_thing_that_happens_to_a_device_is_told_once() {
+        let (sender, told) = std::sync::mpsc::channel();
+        let tell = move |sentence: &str| drop(sender.send(sentence.to_owned()));
+        let device = RemoteDevice::start_telling(Unsteady { exchanges: 0, opens: 0 }, TOUCH, Mounting::default(), tell).unwrap();
+        while device.exchanges() < 40 {
+            thread::sleep(Duration::from_millis(5));
+        }
+        drop(device);
+        let told: Vec<String> = told.into_iter().collect();
+        let parts =
+            ["the toy is not there: no cable", "not ready", "is ready", "the toy stopped answering: unplugged", "is there; its force"];
+        assert_eq!(told.len(), parts.len(), "{told:?}");
+        assert!(told.iter().zip(parts).all(|(sentence, part)| sentence.contains(part)), "{told:?}");
+    }
 
     #[test]
     fn what_reaches_a_device_is_bounded_fresh_and_rises() {
