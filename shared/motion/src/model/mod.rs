@@ -9,6 +9,7 @@ mod container;
 mod fit;
 mod follow;
 mod kind;
+mod local;
 mod packed;
 mod remake;
 mod rotation;

@@ -2,8 +2,9 @@
 //!
 //! Sought is v with x + v(x) = X, X + u(X) = x, at every node x, u trilinear between nodes. Slabs of slices are inverted in parallel, four nodes at a time
 //! ([`Slab`]); what they do not settle goes on by damped Newton. An answer is claimed only if |v + u(x + v)| is at most the tolerance, X lies on
-//! the grid (to the tolerance), and det(1 + ∂u/∂X) > 0 there. Where a field contracts everywhere the determinant is known, and the residual is that of
-//! f32 and a bound on its rounding; what that does not decide is taken in f64 from the vectors in mm.
+//! the grid (to the tolerance), and det(1 + ∂u/∂X) > 0 there. Where a field contracts the determinant is known, and the residual is that of f32 and a bound on
+//! its rounding; what that does not decide is taken in f64 from the vectors in mm. It may contract everywhere, or, where organs slide, in the block around
+//! X ([`Local`]); there the error of X itself is bounded as well.
 //!
 //! Search, for nodes without an answer: a cell's image lies in the box of its eight displaced corners, since trilinear interpolation is convex. So a node
 //! in no cell's box has no inverse on the grid, and that is proved; of the cells whose box holds it, the one whose affine part brings
@@ -13,6 +14,7 @@
 
 use super::super::MotionError;
 use super::at::Shape;
+use super::local::Local;
 use super::slab::{Common, Found, SLICES, Slab};
 use super::steep::SteepWide;
 use maille_displacement::Nodes;
@@ -37,10 +39,21 @@ pub struct FieldInverse {
     pub failures: usize,
     /// nodes that only the search of cells settled
     pub searched: usize,
+    /// nodes whose answer is certified: u contracts around it, so that X is the only rest position near it (the only one of all, where u contracts everywhere),
+    /// and how far from its true place any of these may be [mm]
+    pub certified: usize,
+    /// see `certified`
+    pub error_mm: f32,
 }
+
+/// Nodes that are certified, and the largest bound of their errors [mm].
+type Certified = (usize, f32);
 
 /// Nodes in the box of a cell beyond which the cell is not searched.
 const WIDE: usize = 512;
+
+/// Contraction below which it counts as one.
+const CONTRACTS: f32 = 0.99;
 
 /// What is known of a node.
 #[derive(Clone, Copy, PartialEq)]
@@ -72,7 +85,8 @@ fn invert_field_with(field: &VectorField, tolerance_mm: f64, width: Width) -> Re
     let mut residuals = vec![0.0f32; count];
     let mut states = vec![State::Open; count];
     let slabs = vectors.par_chunks_mut(slab).zip(residuals.par_chunks_mut(slab)).zip(states.par_chunks_mut(slab)).enumerate();
-    slabs.for_each(|(n, ((vectors, residuals), states))| whole.invert_slab(n * SLICES, width, vectors, residuals, states));
+    let certified = slabs.map(|(n, ((vectors, residuals), states))| whole.invert_slab(n * SLICES, width, vectors, residuals, states));
+    let (certified, error_mm) = certified.reduce(|| (0, 0.0), |a, b| (a.0 + b.0, a.1.max(b.1)));
     // where a field contracts a rest position is the only one: what lies beyond is not found elsewhere
     let known = |s: &State| *s == State::Settled || (whole.contracts && *s == State::Beyond);
     let searched = if states.iter().all(known) { 0 } else { whole.search(&mut vectors, &mut residuals, &mut states) };
@@ -84,6 +98,8 @@ fn invert_field_with(field: &VectorField, tolerance_mm: f64, width: Width) -> Re
         outside,
         failures,
         searched,
+        certified,
+        error_mm,
     })
 }
 
@@ -98,8 +114,11 @@ struct Whole<'a> {
     tolerance_mm: f64,
     /// how far beyond the last node an answer still lies on the grid [voxels]
     slack: [f64; 3],
-    /// whether u contracts everywhere: then nothing is folded
+    /// whether u contracts everywhere, then nothing is folded; and by how much, in the max norm of index units
     contracts: bool,
+    steep: f32,
+    /// where it contracts, if not everywhere
+    local: Option<Local>,
     /// what rounding in f32 may have kept from a residual [mm]
     rounding_mm: f32,
 }
@@ -134,6 +153,7 @@ impl<'a> Whole<'a> {
         let largest = size.into_iter().max().unwrap_or(1) as f32;
         let rounding_mm = grid.spacing.iter().fold(0.0f64, |m, s| m.max(*s)) as f32 * f32::EPSILON * (12.0 * longest + largest);
         let inverter = Inverter { scheme: Scheme::Newton, tolerance, contraction: 0.0, weight: [1.0; 3], max_iterations: 60 };
+        let local = (steep >= CONTRACTS).then(|| Local::new(&nodes, size, grid.spacing));
         Ok(Self {
             given,
             shape: Shape::new(grid),
@@ -143,7 +163,9 @@ impl<'a> Whole<'a> {
             inverter: inverter.on_spacing(grid.spacing.map(|s| s as f32)),
             tolerance_mm,
             slack: grid.spacing.map(|s| tolerance_mm / s),
-            contracts: steep < 0.99,
+            contracts: steep < CONTRACTS,
+            steep,
+            local,
             rounding_mm,
         })
     }
@@ -153,7 +175,24 @@ impl<'a> Whole<'a> {
         [at % nx, at / nx % ny, at / (nx * ny)]
     }
 
-    fn invert_slab(&self, first: usize, width: Width, vectors: &mut [[f32; 3]], residuals: &mut [f32], states: &mut [State]) {
+    /// How far from the true rest position one near `at` [index] is at most that leaves this residual [mm]; none where u does not contract around it, or not
+    /// as far as that.
+    #[inline]
+    fn error_mm(&self, at: [f32; 3], residual_mm: f32) -> Option<f32> {
+        let spacing = self.given.grid.spacing;
+        let (smallest, largest) = spacing.iter().fold((f64::MAX, 0.0f64), |(l, h), &s| (l.min(s), h.max(s)));
+        match &self.local {
+            // from the length to the max norm of index units and back
+            None => self.contracts.then(|| 3f32.sqrt() * (largest / smallest) as f32 * residual_mm / (1.0 - self.steep)),
+            Some(local) => {
+                let q = local.at(at);
+                let bound = residual_mm / (1.0 - q);
+                (q < CONTRACTS && bound <= smallest as f32).then(|| 3f32.sqrt() * bound)
+            }
+        }
+    }
+
+    fn invert_slab(&self, first: usize, width: Width, vectors: &mut [[f32; 3]], residuals: &mut [f32], states: &mut [State]) -> Certified {
         let size = self.given.grid.size;
         let column = |c: usize| std::array::from_fn(|r| if r < 3 { self.mm_from_index[(r, c)] as f32 } else { 0.0 });
         let common = Common {
@@ -163,17 +202,32 @@ impl<'a> Whole<'a> {
             mm_from_index: [column(0), column(1), column(2)],
         };
         let (tolerance_mm, count) = (self.tolerance_mm as f32, states.len() / (size[0] * size[1]));
+        let mut certified: Certified = (0, 0.0);
         let take = |at: usize, node: [usize; 3], found: Found| -> Option<[f32; 3]> {
             let residual = found.square.sqrt() + self.rounding_mm;
-            if found.within && found.inside && self.contracts && residual <= tolerance_mm {
-                (vectors[at], residuals[at], states[at]) = (found.mm, residual, State::Settled);
-                return None;
+            let place = |v: [f32; 3]| std::array::from_fn(|c| node[c] as f32 + v[c]);
+            let mut note = |error: Option<f32>| {
+                if let Some(error) = error {
+                    certified = (certified.0 + 1, certified.1.max(error));
+                }
+            };
+            if found.within && found.inside && residual <= tolerance_mm {
+                let error = self.error_mm(place(found.v), residual);
+                if error.is_some() {
+                    note(error);
+                    (vectors[at], residuals[at], states[at]) = (found.mm, residual, State::Settled);
+                    return None;
+                }
             }
             let (state, v, r, better) = self.decide(node, &found);
+            if state == State::Settled {
+                note(self.error_mm(place(better.unwrap_or(found.v)), r));
+            }
             (vectors[at], residuals[at], states[at]) = (v, r, state);
             better
         };
         quads::run_with(width, Slab { common, first, count, take });
+        certified
     }
 
     /// What is not plain: an answer that needs a closer look, or none yet. Gives v for others to go on from, where it differs [voxels].
@@ -428,6 +482,32 @@ mod tests {
     }
 
     #[test]
+    fn where_only_a_border_slides_errors_elsewhere_are_bounded_and_keep_their_bounds() {
+        // smooth, and halves that slide by 5 mm along j = 17 within one cell
+        let smooth = |[i, j, k]: [f64; 3]| [1.2 * (i * 0.2 + k * 0.1).sin(), 1.0 * (j * 0.15).cos(), 1.5 * (i * 0.1 - j * 0.12).sin()];
+        let slides = field(|at| {
+            let u = smooth(at);
+            [u[0], u[1], u[2] + if at[1] < 16.5 { 2.5 } else { -2.5 }]
+        });
+        let found = invert_field(&slides, 1e-3).unwrap();
+        let finer = invert_field(&slides, 1e-5).unwrap();
+        let settled = found.residual_mm.values.iter().filter(|r| **r >= 0.0).count();
+        println!("{} of {settled} answers certified, to {:.1e} mm", found.certified, found.error_mm);
+        assert!(found.certified > settled * 6 / 10 && found.error_mm > 0.0 && found.error_mm < 0.02);
+        // no answer is further from a much finer one than the bound, but where the border is near and none was given
+        let apart = |n: usize| {
+            let (a, b) = (found.field.vectors[n], finer.field.vectors[n]);
+            (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f32>().sqrt()
+        };
+        let wrong = (0..slides.vectors.len()).filter(|&n| apart(n) > found.error_mm + 1e-4).count();
+        let uncertified = settled - found.certified;
+        assert!(wrong <= uncertified / 100, "{wrong} of {uncertified}");
+        // a field that contracts everywhere is certified everywhere
+        let calm = invert_field(&field(smooth), 1e-3).unwrap();
+        assert_eq!(calm.certified, calm.residual_mm.values.iter().filter(|r| **r >= 0.0).count());
+    }
+
+    #[test]
     fn rest_is_its_own_inverse_to_the_last_node_and_a_shift_loses_what_it_uncovers() {
         let still = invert_field(&field(|_| [0.0; 3]), 1e-3).unwrap();
         assert!((still.outside, still.failures) == (0, 0) && still.field.vectors.iter().all(|v| *v == [0.0; 3]));
@@ -444,11 +524,14 @@ mod tests {
         let found = invert_field(&sliding, 1e-3).unwrap();
         assert_eq!(found.failures, 0);
         assert!(found.outside < 4 * 37 * 34, "{}", found.outside);
+        // away from the cell that tears (and one block on each side of it) every answer is certified
+        assert!(found.certified > 37 * 34 * 21 / 2 && found.error_mm < 2e-3, "{} {}", found.certified, found.error_mm);
         // X ↦ −X/2 + …: turned inside out everywhere
         let (c, s) = (0.4f64.cos(), 0.4f64.sin());
         let folded = field(|[i, _, _]| [-1.5 * (i - 18.0) * c, -1.5 * (i - 18.0) * s, 0.0]);
         let found = invert_field(&folded, 1e-3).unwrap();
         assert!(found.failures > 0 && found.failures + found.outside == found.field.vectors.len(), "{} {}", found.failures, found.outside);
+        assert_eq!(found.certified, 0);
         let mut broken = folded;
         broken.vectors[77][1] = f32::NAN;
         assert_eq!(invert_field(&broken, 1e-3).unwrap_err(), MotionError::Vector { field: 0, node: 77 });
