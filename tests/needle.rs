@@ -7,16 +7,17 @@
 #[allow(dead_code)] // shared with tests that ask for more
 mod support;
 
-use maille_breathing::Regions;
+use maille_breathing::{Regions, Signal as BreathSignal};
 use maille_contract::needle::{NeedleDrag, NeedleLog, NeedleState};
-use maille_contract::{Role, ServiceState, ToolState};
+use maille_contract::{Role, ServiceState, Stamp, ToolState};
+use maille_motion::{MotionModel, Precision, model::sampled};
 use maille_needle::V3;
 use maille_phantom::{Kind, Phantom};
 use maille_raycast::Camera;
 use maille_scene::Scene;
 use maille_store::Reader;
 use maille_transport::{ControlMap, Domain, Node, monotonic_ns};
-use maille_volume::{BrickSource as _, Rescale, Volume, io};
+use maille_volume::{BrickSource as _, Grid, Rescale, Volume, io};
 use rustix::process::Signal;
 use std::{process::Command, time::Duration};
 use support::{Run, Scratch, eventually, left_over, report, signal};
@@ -348,6 +349,83 @@ fn a_label_map_beside_a_file_says_what_is_where_and_one_on_another_grid_is_refus
         let said = String::from_utf8_lossy(&out.stderr);
         assert_eq!(out.status.code(), Some(1), "{said}");
         assert!(said.contains("aside.nrrd") && said.contains("0.40 mm from the volume's"), "{said}");
+    }
+}
+
+/// Soft tissue from x = 20 mm on, of one CT value; a vessel that only the label map knows lies at z from 40 to 46 mm. The needle goes in along z = 32 mm;
+/// a deep breath brings everything down by 11 mm.
+const LABELLED: &str = r#"
+name = "labelled"
+[breathing]
+signal = "console"
+[needle]
+gauge = 18
+length_mm = 150.0
+[[needle.tissue]]
+name = "liver"
+labels = [1]
+[[needle.tissue]]
+name = "vessel"
+labels = [2]
+forbidden = true
+[tool]
+kind = "needle"
+device = "path"
+radius_mm = 0.6
+loop = false
+[deformation]
+threshold_hu = -300.0
+[effects]
+breathing = true
+needle = true
+[console]
+enabled = false
+"#;
+
+#[test]
+fn labels_are_carried_by_the_breath_and_the_report_names_what_it_brought_before_the_needle() {
+    let scratch = Scratch::new("needle-carried");
+    let grid = Grid::axis_aligned([96, 64, 72], [1.0; 3]);
+    let of = |value: &dyn Fn(usize, usize) -> i16| -> Vec<i16> { (0..grid.voxel_count()).map(|n| value(n % 96, n / (96 * 64))).collect() };
+    let rescale = Rescale { slope: 1.0, intercept: 0.0 };
+    let ct = Volume::new(grid.clone(), rescale, of(&|x, _| if x < 20 { -1000 } else { 40 }));
+    let vessel = |x: usize, z: usize| (50..=54).contains(&x) && (40..=46).contains(&z);
+    let labels = Volume::new(grid.clone(), rescale, of(&|x, z| if x < 20 { 0 } else { 1 + i16::from(vessel(x, z)) }));
+    let nodes = Grid { origin: [-20.0; 3], ..Grid::axis_aligned([9; 3], [16.0; 3]) };
+    let model = MotionModel::of_signals(&[sampled(&nodes, |_| [0.0, 0.0, -11.0])], Precision::I16).unwrap();
+    let [image, map, motion] = ["ct.nrrd", "labels.nrrd", "down.motion"].map(|name| scratch.file(name));
+    io::write_volume(&image, &ct).unwrap();
+    io::write_volume(&map, &labels).unwrap();
+    std::fs::write(&motion, model.to_bytes()).unwrap();
+    let mut text =
+        LABELLED.replace("[breathing]", &format!("[volume]\nfile = {image:?}\nlabels = {map:?}\n[breathing]\nmodel = {motion:?}"));
+    for (time, x) in [(0.0, 5.0), (2.5, 5.0), (4.5, 70.0), (4.7, 70.0), (5.7, 5.0)] {
+        text += &format!("[[tool.path]]\ntime_s = {time:?}\nmm = [{x:?}, 32.0, 32.0]\ndirection = [1.0, 0.0, 0.0]\n");
+    }
+    for deep in [true, false] {
+        let file = scratch.file("run.json");
+        let living = Living::start(&scratch, &text, &["--report", file.to_str().unwrap()]);
+        if deep {
+            // as the page's slider would: full, and held there
+            let page = BreathSignal::open(&living.domain, &living.scene).unwrap().expect("it breathes");
+            let stamp = Stamp { time_ns: (living.now_s() * 1e9) as u64, sequence: 1, incarnation: 1 };
+            living.control.breath.store(&page.command(stamp, false, Some(1.0)).unwrap());
+        }
+        eventually("the needle is out again", || {
+            living.control.needle_log.load::<NeedleLog>().is_some_and(|(log, _)| log.deepest_mm > 45.0) && living.tick().0.path_nodes == 0
+        });
+        living.end();
+        let report = report(&file);
+        let events: Vec<&serde_json::Value> = report["needle"]["events"].as_array().unwrap().iter().collect();
+        let met = |name: &str| events.iter().find(|e| e["tissue"] == name && e["what"] != "withdrawn");
+        println!("deep breath: {deep}; {events:?}");
+        assert!(met("liver").is_some(), "{events:?}");
+        assert_eq!(report["needle"]["forbidden_touched"], if deep { serde_json::json!(["vessel"]) } else { serde_json::json!([]) });
+        if let Some(vessel) = met("vessel") {
+            // where it is told to lie is its place in the patient at rest: in world the needle went along z = 32
+            let at: Vec<f64> = vessel["reference_mm"].as_array().unwrap().iter().filter_map(serde_json::Value::as_f64).collect();
+            assert!((at[0] - 49.5).abs() < 0.6 && (at[2] - 43.0).abs() < 0.7, "{at:?}");
+        }
     }
 }
 

@@ -90,6 +90,8 @@ fn tell(args: &Args, found: &FieldInverse, determinant: &ScalarField, seconds: f
             "outside": found.outside,
             "failures": found.failures,
             "searched": found.searched,
+            "certified": found.certified,
+            "certified_error_mm": found.error_mm,
             "residual_mm": { "p50": share(50), "p95": share(95), "p99": share(99), "worst": share(100) },
             "folded_cells": folded,
             "determinant": [low, high],
@@ -107,6 +109,12 @@ fn tell(args: &Args, found: &FieldInverse, determinant: &ScalarField, seconds: f
     );
     if let (Some(p95), Some(worst)) = (share(95), share(100)) {
         println!("residual: p95 {p95:.2e} mm, worst {worst:.2e} mm");
+    }
+    if found.certified > 0 {
+        println!(
+            "certified: {} nodes, around which the field contracts, are within {:.2e} mm of their rest position",
+            found.certified, found.error_mm
+        );
     }
     println!("det J from {low:.3} to {high:.3}, {folded} cells folded");
 }

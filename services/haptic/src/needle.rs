@@ -20,7 +20,7 @@ use maille_contract::needle::{
 };
 use maille_needle::{
     AIR, Breathing, Capsule, EventKind, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q,
-    RodParameters, Tissue, V3,
+    RodParameters, Tissue, V3, limits::TIP_SHARE,
 };
 use maille_scene::{Needle, NeedleTissue, Scene};
 use maille_store::Region;
@@ -143,6 +143,13 @@ impl NeedleStage {
             config.device_n_per_mm = renders_n_per_mm(device, 1.0 / scene.haptic.rate_hz).clamp(0.01, config.device_n_per_mm);
         }
         let materials: Vec<Material> = n.tissue.iter().map(material).collect();
+        let most = TIP_SHARE * config.device_n_per_mm;
+        if let Some(device) = device.filter(|_| materials.iter().any(|m| m.a1_n_per_mm > most)) {
+            eprintln!(
+                "maille-haptic: springs before the needle's tip were lowered to {most:.2} N/mm, of {:.2} N/mm that the device ({}) renders passively",
+                config.device_n_per_mm, device.name
+            );
+        }
         let tool = NeedleTool::new(config, MaterialTable::new(&materials).map_err(fail)?).map_err(fail)?;
         let has_labels = scene.volume.file.is_none() || scene.volume.labels.is_some();
         let labels = has_labels.then(|| Region::open(domain, LABELS_REGION, LABELS_KIND)).transpose()?;

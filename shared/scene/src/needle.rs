@@ -47,7 +47,7 @@ pub struct NeedleTissue {
     pub hu: Option<[f64; 2]>,
     /// holds the shaft in its path [N/mm] a node, 0.001 to 1000
     pub stiffness_n_per_mm: f64,
-    /// a₁ of the tip's spring [N/mm], 0.001 to 1000
+    /// a₁ of the tip's spring [N/mm], 0.001 to 1000; no more is given out than the device renders passively (1.5 N/mm where none is known)
     pub a1_n_per_mm: f64,
     /// a₂, its hardening [N/mm²], 0 to 1000
     pub a2_n_per_mm2: f64,

@@ -114,9 +114,11 @@ struct Whole<'a> {
     tolerance_mm: f64,
     /// how far beyond the last node an answer still lies on the grid [voxels]
     slack: [f64; 3],
-    /// whether u contracts everywhere, then nothing is folded; and by how much, in the max norm of index units
+    /// whether u contracts everywhere: then nothing is folded
     contracts: bool,
-    steep: f32,
+    /// bound on an error over its residual, where it does: from the length to the max norm of index units and back, and 1/(1 − q)
+    per_residual: f32,
+    smallest_mm: f32,
     /// where it contracts, if not everywhere
     local: Option<Local>,
     /// what rounding in f32 may have kept from a residual [mm]
@@ -164,7 +166,8 @@ impl<'a> Whole<'a> {
             tolerance_mm,
             slack: grid.spacing.map(|s| tolerance_mm / s),
             contracts: steep < CONTRACTS,
-            steep,
+            per_residual: 3f32.sqrt() * (grid.spacing.iter().fold(0.0f64, |m, &s| m.max(s)) / grid.min_spacing()) as f32 / (1.0 - steep),
+            smallest_mm: grid.min_spacing() as f32,
             local,
             rounding_mm,
         })
@@ -179,15 +182,12 @@ impl<'a> Whole<'a> {
     /// as far as that.
     #[inline]
     fn error_mm(&self, at: [f32; 3], residual_mm: f32) -> Option<f32> {
-        let spacing = self.given.grid.spacing;
-        let (smallest, largest) = spacing.iter().fold((f64::MAX, 0.0f64), |(l, h), &s| (l.min(s), h.max(s)));
         match &self.local {
-            // from the length to the max norm of index units and back
-            None => self.contracts.then(|| 3f32.sqrt() * (largest / smallest) as f32 * residual_mm / (1.0 - self.steep)),
+            None => self.contracts.then_some(self.per_residual * residual_mm),
             Some(local) => {
                 let q = local.at(at);
                 let bound = residual_mm / (1.0 - q);
-                (q < CONTRACTS && bound <= smallest as f32).then(|| 3f32.sqrt() * bound)
+                (q < CONTRACTS && bound <= self.smallest_mm).then_some(3f32.sqrt() * bound)
             }
         }
     }

@@ -9,9 +9,8 @@
 
 use super::NeedleTool;
 use crate::AIR;
+use crate::limits::TIP_SHARE;
 
-/// Part of what the device can hold that is the tip's; friction has what is left of the whole.
-pub(super) const TIP_SHARE: f64 = 0.75;
 /// Cutting over this length makes relaxed tissue fresh [mm].
 const FRESH_MM: f64 = 1.0;
 /// Time in which a needle that was let go comes to its balance [s].

@@ -98,7 +98,7 @@ impl NeedleTool {
         Ok(Self {
             rod: Rod::with_rest(c.rod, room + 2, curvature)?,
             path,
-            table: table.no_stiffer_than(axial::TIP_SHARE * c.device_n_per_mm, c.max_force_n),
+            table: table.no_stiffer_than(crate::limits::TIP_SHARE * c.device_n_per_mm, c.max_force_n),
             world: Vec::with_capacity(room),
             arc: Vec::with_capacity(room),
             position: V3::zeros(),
