@@ -6,7 +6,7 @@
 
 #[path = "../../services/supervisor/tests/support/mod.rs"]
 #[allow(dead_code)] // shared with tests that ask for more
-mod support;
+pub mod support;
 
 use maille_contract::{Commit, Role, ServiceState, Stamp, ToolState, UndoCommand, control::Counter, messages::TOOL_IN_CONTACT};
 use maille_store::{FREE_PINS, Reader};
@@ -23,20 +23,22 @@ pub fn scene(size: usize, period_s: f64) -> String {
         .replace("size = 256", &format!("size = {size}"))
         .replace("period_s = 8.0", &format!("period_s = {period_s:?}"))
         .replace("kind = \"incision\"", "kind = \"incision\"\nloop = false")
-        .replace("distance = 0.35", "distance = 0.35\nsize = [320, 240]\nsection_size = [96, 72]");
+        // every frame whole: pictures are compared, and one drawn coarsely to be in time differs everywhere
+        .replace("distance = 0.35", "distance = 0.35\nadapt = false\nsize = [320, 240]\nsection_size = [96, 72]");
     assert_ne!(text, shipped);
     text + "\n[console]\nenabled = false\n"
 }
 
-struct Living {
+/// A run that lives, and what can be asked of it.
+pub struct Living {
     run: Run,
-    domain: Domain,
-    control: ControlMap,
-    reader: Reader,
+    pub domain: Domain,
+    pub control: ControlMap,
+    pub reader: Reader,
 }
 
 impl Living {
-    fn start(scratch: &Scratch, text: &str, more: &[&str]) -> Self {
+    pub fn start(scratch: &Scratch, text: &str, more: &[&str]) -> Self {
         let path = scratch.write("scene.toml", text);
         let run = Run::start(Command::new(env!("CARGO_BIN_EXE_maille")).arg("run").arg(path).arg("--headless").args(more));
         let domain = Domain::named(&run.domain()).expect("the run's domain");
@@ -48,15 +50,15 @@ impl Living {
         Self { run, domain, control, reader }
     }
 
-    fn now_s(&self) -> f64 {
+    pub fn now_s(&self) -> f64 {
         self.control.time_ns(monotonic_ns()) as f64 * 1e-9
     }
 
-    fn tool(&self) -> ToolState {
+    pub fn tool(&self) -> ToolState {
         self.control.tool.load::<ToolState>().map(|(tool, _)| tool).expect("haptic has said something")
     }
 
-    fn commits(&self) -> u64 {
+    pub fn commits(&self) -> u64 {
         self.control.service(Role::Deformation).counter(Counter::Commits)
     }
 
@@ -85,7 +87,7 @@ impl Living {
     }
 
     /// Whether every stored byte of every brick, aprons and skip cells included, is that of rest.
-    fn is_at_rest(&self) -> bool {
+    pub fn is_at_rest(&self) -> bool {
         let (snapshot, rest) = (self.reader.snapshot(), self.reader.rest());
         (0..snapshot.layout().count() as u32).all(|id| {
             let (a, b) = (snapshot.brick(id), rest.brick(id));
@@ -93,12 +95,12 @@ impl Living {
         })
     }
 
-    fn undo(&self, undos: u64) {
+    pub fn undo(&self, undos: u64) {
         let stamp = Stamp { time_ns: 0, sequence: undos, incarnation: 1 };
         self.control.undo.store(&UndoCommand { stamp, undos });
     }
 
-    fn end(mut self) {
+    pub fn end(mut self) {
         signal(self.run.pid(), Signal::TERM);
         assert!(self.run.wait().success(), "{}", self.run.printed());
         assert_eq!(left_over(self.domain.name()), [""; 0]);
@@ -139,7 +141,7 @@ pub fn operate(name: &str, text: &str, more: &[&str], kill: bool) -> Vec<([usize
     let (frames, commits) = (node.frame_subscriber().expect("frames"), node.subscriber::<Commit>().expect("commits"));
     // as the patient was: a frame of the first epoch, where this machine is quick enough to draw one before the first cut
     let before = loop_until(|| match frames.latest().filter(|frame| frame.header().epoch == 1) {
-        Some(frame) => Some(Some(picture(&frame, &format!("{name}-before")))),
+        Some(frame) => Some(Some((picture(&frame, &format!("{name}-before")), living.tool().tip_mm))),
         None => (living.commits() > 0).then_some(None),
     });
 
@@ -199,8 +201,14 @@ pub fn operate(name: &str, text: &str, more: &[&str], kill: bool) -> Vec<([usize
     let back = picture(&frame_of(living.reader.epoch()), &format!("{name}-back"));
     let differ = |a: &[u8], b: &[u8]| a.iter().zip(b).filter(|(a, b)| a.abs_diff(**b) > 8).count();
     assert!(differ(&after, &back) > 300, "the cut is seen: {} bytes differ", differ(&after, &back));
-    if let Some(before) = before {
-        println!("{name}: {} bytes of the picture differ from before the cut where all is taken back", differ(&before, &back));
+    // the tool is in the picture: where it stands as it stood, nothing differs
+    if let Some((before, tip)) = before {
+        let moved = tip.iter().zip(living.tool().tip_mm).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let bytes = before.iter().zip(&back).filter(|(a, b)| a != b).count();
+        println!(
+            "{name}: {bytes} bytes of the picture differ from before the cut where all is taken back, the tool {moved:.2} mm elsewhere"
+        );
+        assert!(moved > 0.02 || bytes == 0, "{bytes} bytes differ");
     }
     drop((frames, commits, node));
     living.end();

@@ -7,7 +7,10 @@
 //! Each element's byte in the channel of cuts numbers the stroke that took it away, so that a process that starts anew can take back what its predecessor cut.
 //! A **stroke** is all that is cut within [`STROKE_NS`] of each other. The last [`UNDOABLE`] strokes can be taken back; an older one stays
 //! ([`FOR_GOOD`]). Taking back a stroke brings the elements' links back, but for those to elements that are still away. Tissue at rest is then what it was bit
-//! for bit; displaced tissue (of a patient deformed before: the tool itself pushes nothing) is mapped anew, within the mapper's tolerance.
+//! for bit. Displaced tissue (of a patient deformed before: the tool itself pushes nothing) is mapped anew, and there a voxel may differ by what the
+//! mapper's tolerance of a hundredth of a voxel is worth, 10 HU at the steepest edges: which answer within it the mapper gives depends on the voxels that it is
+//! asked for together (it goes from row to row), and those are others than when the tissue was pushed. To be exact there too would take a copy of each
+//! brick a stroke, in the store, since a successor has to give the same bits.
 //!
 //! Invariant: in a scene with incisions nothing else cuts links (the scene's tool is one), so that a link is cut exactly when one of its ends is away.
 //! Cost: the elements of the box, and the mapper's of so many voxels.

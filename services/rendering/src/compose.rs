@@ -3,7 +3,7 @@
 use crate::{backend::Backend, overlay, view::View};
 use maille_contract::{FrameHeader, Switches, ToolState, messages::ViewRect};
 use maille_raycast::{
-    Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, ultrasound,
+    Capsule, Extras, Geometry, Labels, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, ultrasound,
 };
 use maille_scene::{Scene, registry};
 use maille_transport::{Stopwatch, monotonic_ns};
@@ -25,7 +25,7 @@ fn seen_from(capsule: &Capsule, eye: [f64; 3], least: f64) -> Capsule {
 /// Draws frames into memory of its own.
 pub(crate) struct Composer {
     skip: Option<Skip>,
-    pictures: [Picture; 5],
+    pub(crate) pictures: [Picture; 5],
     /// how finely the next 3D view is drawn
     pub quality: Quality,
     /// displacement whose colour over a section is opaque [mm]
@@ -38,6 +38,8 @@ pub(crate) struct Composer {
     pub view_ns: u64,
     /// surfaces seen from near are those of the smooth function
     zoom: bool,
+    /// the scene's organs
+    pub labels: Option<Labels>,
 }
 
 impl Composer {
@@ -57,6 +59,7 @@ impl Composer {
             coarse: Picture::new(0, 0),
             view_ns: 0,
             zoom,
+            labels: None,
         }
     }
 
@@ -112,8 +115,14 @@ impl Composer {
         let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
         let in_3d = Geometry { capsules: &thick, meshes: &[] };
         // an endoscope does not see itself
-        let extras =
-            Extras { warp, geometry: Some(&in_3d).filter(|_| !at_tip), barrel: view.barrel(at_tip), zoom: self.zoom, ..Extras::default() };
+        let extras = Extras {
+            warp,
+            labels: self.labels.as_ref(),
+            geometry: Some(&in_3d).filter(|_| !at_tip),
+            barrel: view.barrel(at_tip),
+            zoom: self.zoom,
+            ..Extras::default()
+        };
         let start = monotonic_ns();
         if [w, h] == [whole.width, whole.height] {
             self.backend.render(&extras, source, skip, &camera, &settings, whole)?;
@@ -128,7 +137,7 @@ impl Composer {
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
-            let overlay = Overlay { warp, displacement_mm: self.overlay_mm, geometry: Some(&bodies), ..Overlay::default() };
+            let overlay = Overlay { warp, labels: self.labels.as_ref(), displacement_mm: self.overlay_mm, geometry: Some(&bodies) };
             self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
         watch.split("sections");

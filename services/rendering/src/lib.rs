@@ -16,6 +16,7 @@ mod gpu_tests;
 #[cfg(test)]
 mod in_place;
 mod needle;
+mod organs;
 mod overlay;
 #[doc(hidden)]
 pub mod turns;
@@ -47,6 +48,8 @@ pub enum RenderingError {
     Scene(String),
     #[error("the transfer function `{name}` cannot be used: {reason}")]
     Transfer { name: String, reason: String },
+    #[error("the organ `{name}` cannot be found: {reason}")]
+    Organ { name: String, reason: String },
     #[error("the thread pool could not be made: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
 }
@@ -94,6 +97,7 @@ fn frames<W: Stopwatch + Send>(
     let tolerance_mm = scene.breathing.picture_tolerance_mm;
     let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm)));
     composer.backend = backend::Backend::of(scene, reader);
+    composer.labels = pool.install(|| organs::labels(scene, &reader.rest()))?;
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);

@@ -1,6 +1,6 @@
 //! Frames one by one, without the loop's rate and its publishing: for measuring what a frame takes. The calling thread's pool draws.
 
-use crate::{RenderingError, breath::Breather, compose::Composer, view::View};
+use crate::{RenderingError, breath::Breather, compose::Composer, organs, view::View};
 use maille_breathing::Patient;
 use maille_contract::ToolState;
 use maille_scene::{BoxMm, Scene};
@@ -24,7 +24,9 @@ impl<'a> Turns<'a> {
     pub fn open(domain: &Domain, scene: &Scene, reader: &'a Reader, patient: Option<Patient<'a>>) -> Result<Self, RenderingError> {
         let view = View::new(scene, &BoxMm::of(&reader.info().grid))?;
         let breather = patient.map(|patient| Breather::new(patient, reader.info(), scene.breathing.picture_tolerance_mm));
-        Ok(Self { control: ControlMap::open(domain)?, reader, composer: Composer::new(scene), view, breather })
+        let mut composer = Composer::new(scene);
+        composer.labels = organs::labels(scene, &reader.rest())?;
+        Ok(Self { control: ControlMap::open(domain)?, reader, composer, view, breather })
     }
 
     /// Draws the newest state at a simulation time; false where the view could not be drawn.

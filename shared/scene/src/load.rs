@@ -7,9 +7,10 @@ use crate::{
     breathing::Signal,
     error::{Fault, SceneError, Source},
     limits::{LIMITS, range_text},
+    organ,
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, PhantomKind, Scene, Size},
-    sections::TouchedSurface,
+    sections::{Mode, TouchedSurface},
     suggest,
     tool::{Approach, Device, PROFILES, PathPoint, Shape, ToolKind},
 };
@@ -145,6 +146,10 @@ fn read(name: &str, text: &str) -> Result<(Scene, Document), SceneError> {
     check_tool(&document, &scene, &mut faults);
     check_tissues(&document, &scene, &mut faults);
     check_effects(&document, &scene, &mut faults);
+    let is_volume = scene.rendering.mode == Mode::Volume;
+    for (path, message) in organ::faults(&scene.organs, scene.rendering.alone.as_deref(), is_volume) {
+        faults.push(document.fault(&path, message, "here", None));
+    }
     document.refuse(faults)?;
     Ok((scene, document))
 }

@@ -4,6 +4,7 @@ use crate::{
     breathing::Breathing,
     incision::Incision,
     needle::Needle,
+    organ::Organ,
     sections::{Console, Deformation, Haptic, Memory, Rendering, TouchedSurface},
     tissue::{self, Tissue},
     tool::{DeviceSection, Tool},
@@ -195,6 +196,9 @@ pub struct Scene {
     /// mechanical laws by HU, ascending
     #[serde(rename = "tissue")]
     pub tissues: Vec<Tissue>,
+    /// parts of the patient by their values
+    #[serde(rename = "organ", skip_serializing_if = "Vec::is_empty")]
+    pub organs: Vec<Organ>,
 }
 
 impl Default for Scene {
@@ -216,6 +220,7 @@ impl Default for Scene {
             memory: Memory::default(),
             effects: BTreeMap::new(),
             tissues: tissue::defaults(),
+            organs: Vec::new(),
         }
     }
 }

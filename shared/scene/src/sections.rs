@@ -221,6 +221,9 @@ pub struct Rendering {
     pub floor_hz: f64,
     /// what the 3D view shows
     pub mode: Mode,
+    /// with mode `volume`: the 3D view shows this `[[organ]]` alone
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alone: Option<String>,
     /// preset (`ct`, `bone`, `soft-tissue`, `lung`, `skin`) or a file with a transfer function
     pub transfer: String,
     /// where it is seen from
@@ -275,6 +278,7 @@ impl Default for Rendering {
             rate_hz: 30.0,
             floor_hz: 12.0,
             mode: Mode::Volume,
+            alone: None,
             transfer: "ct".into(),
             camera: CameraKind::Free,
             eye: None,

@@ -1,0 +1,133 @@
+//! The scene's organs: labels of the patient at rest, found once at the start, held by this process alone.
+//!
+//! `maille-surface` finds them; here is what a scene says of them. An organ that comes later in the scene takes what two have. One byte a voxel, only in a scene
+//! that has organs.
+
+use crate::RenderingError;
+use maille_raycast::Labels;
+use maille_scene::{BoxMm, Scene};
+use maille_surface::{Selection, organ};
+use maille_volume::BrickSource;
+
+/// Labels of the scene's organs, numbered from 1; `None` in a scene without. With `rendering.alone` everything else lets light through.
+pub(crate) fn labels(scene: &Scene, rest: &impl BrickSource) -> Result<Option<Labels>, RenderingError> {
+    if scene.organs.is_empty() {
+        return Ok(None);
+    }
+    let grid = &rest.info().grid;
+    let bounds = BoxMm::of(grid);
+    let mut voxels = vec![0u8; grid.voxel_count()];
+    for (n, said) in scene.organs.iter().enumerate() {
+        let fault = |reason: String| RenderingError::Organ { name: said.name.clone(), reason };
+        let seed = match said.seed_mm.or(said.seed.map(|fraction| bounds.at(fraction))) {
+            None => None,
+            Some(mm) => {
+                let index = grid.index_from_world(mm).map(f64::round);
+                if !(0..3).all(|c| index[c] >= 0.0 && index[c] < grid.size[c] as f64) {
+                    return Err(fault(format!("its seed {mm:.1?} mm lies outside the volume")));
+                }
+                Some(index.map(|v| v as usize))
+            }
+        };
+        let selection = Selection { ranges: said.hu.clone(), seed, smallest_mm3: said.islands_mm3 };
+        let found = organ(rest, &selection).map_err(|e| fault(e.to_string()))?;
+        for (label, inside) in voxels.iter_mut().zip(&found.labels) {
+            if *inside != 0 {
+                *label = n as u8 + 1;
+            }
+        }
+    }
+    let mut labels = Labels::new(grid.size, voxels).map_err(|reason| RenderingError::Organ { name: "all".into(), reason })?;
+    if let Some(alone) = &scene.rendering.alone {
+        let number = 1 + scene.organs.iter().position(|organ| organ.name == *alone).unwrap_or(0);
+        // as the transfer function has it, and nothing beside it
+        labels.opacity = [0.0; 256];
+        labels.opacity[number] = 1.0;
+        labels.colors[number][3] = 0.0;
+    }
+    Ok(Some(labels))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{compose::Composer, view::View};
+    use maille_transport::Untimed;
+    use maille_volume::{BrickedVolume, Grid, Rescale, Volume};
+
+    /// Two balls of bone in air, the larger at low x.
+    fn balls() -> BrickedVolume {
+        let mut grid = Grid::axis_aligned([64, 40, 40], [1.0; 3]);
+        grid.origin = [-32.0, -20.0, -20.0];
+        let ball =
+            |p: [f64; 3], x: f64, r: f64| 1000.0 / (1.0 + (2.0 * (((p[0] - x).powi(2) + p[1] * p[1] + p[2] * p[2]).sqrt() - r)).exp());
+        let voxels = (0..grid.voxel_count())
+            .map(|n| {
+                let p = grid.world_from_index([n % 64, n / 64 % 40, n / (64 * 40)].map(|v| v as f64));
+                (ball(p, -15.0, 12.0) + ball(p, 17.0, 9.0) - 1000.0) as i16
+            })
+            .collect();
+        BrickedVolume::from_volume(&Volume::new(grid, Rescale::IDENTITY, voxels))
+    }
+
+    fn scene(more: &str) -> Scene {
+        let text = "[rendering]\nsize = [96, 64]\nsection_size = [64, 40]\ntransfer = \"skin\"\nfrom = [0.0, -1.0, 0.0]\nALONE[effects]\nsections = true\n\
+             [[organ]]\nname = \"left\"\nhu = [[-500.0, 3000.0]]\nseed_mm = [17.0, 0.0, 0.0]\n\
+             [[organ]]\nname = \"right\"\nhu = [[-500.0, 3000.0]]\nseed = [0.27, 0.5, 0.5]\n";
+        Scene::parse("organs", &text.replace("ALONE", more)).expect("a scene")
+    }
+
+    /// The 3D view and the coronal section of a scene.
+    fn drawn(scene: &Scene, bricks: &BrickedVolume) -> [Vec<u8>; 2] {
+        let view = View::new(scene, &BoxMm::of(&bricks.info().grid)).expect("a view");
+        let mut composer = Composer::new(scene);
+        composer.labels = labels(scene, bricks).expect("the organs are there");
+        composer.draw(bricks, None, &view, None, false, None, &mut Untimed).expect("it can be drawn");
+        [0, 2].map(|n| composer.pictures[n].rgb.clone())
+    }
+
+    #[test]
+    fn an_organ_alone_is_seen_as_it_was_and_the_other_is_not() {
+        let bricks = balls();
+        let mut none = scene("");
+        none.organs.clear();
+        let background = drawn(&none, &bricks)[0][..3].to_vec();
+        // how much of each half of the picture is not background
+        let halves = |rgb: &[u8]| -> [usize; 2] {
+            let mut count = [0; 2];
+            for (n, pixel) in rgb.chunks_exact(3).enumerate() {
+                count[usize::from(n % 96 >= 48)] += usize::from(pixel.iter().zip(&background).any(|(a, b)| a.abs_diff(*b) > 2));
+            }
+            count
+        };
+        // seen from the front the patient's left is at the right of the picture
+        let [whole, section] = drawn(&none, &bricks);
+        let all = halves(&whole);
+        assert!(all[0] > 100 && all[1] > 100, "{all:?}");
+        let [left, _] = drawn(&scene("alone = \"left\"\n"), &bricks);
+        let [right, _] = drawn(&scene("alone = \"right\"\n"), &bricks);
+        let (l, r) = (halves(&left), halves(&right));
+        assert!((l[0] == 0) != (l[1] == 0) && (r[0] == 0) != (r[1] == 0) && (l[0] == 0) != (r[0] == 0), "{l:?} {r:?}");
+        // nothing is between them: the two together are the whole, but for the rim that labels end at
+        for side in 0..2 {
+            let one = l[side].max(r[side]) as f64 / all[side] as f64;
+            assert!((0.85..=1.001).contains(&one), "{one} of what was seen there");
+        }
+        // sections colour organs and hide nothing
+        let [_, coloured] = drawn(&scene(""), &bricks);
+        let grey = |rgb: &[u8]| rgb.chunks_exact(3).filter(|p| p[0] == p[1] && p[1] == p[2]).count();
+        assert!(grey(&section) > grey(&coloured) + 200, "{} {}", grey(&section), grey(&coloured));
+    }
+
+    #[test]
+    fn an_organ_that_is_not_there_is_said() {
+        let bricks = balls();
+        for (from, to) in [("[17.0, 0.0, 0.0]", "[1.0, 0.0, 0.0]"), ("[17.0, 0.0, 0.0]", "[170.0, 0.0, 0.0]")] {
+            let mut scene = scene("");
+            let moved: Scene = Scene::parse("moved", &scene.to_toml().replace(from, to)).expect("a scene");
+            scene.organs = moved.organs;
+            let error = labels(&scene, &bricks).unwrap_err().to_string();
+            assert!(error.contains("left"), "{error}");
+        }
+    }
+}
