@@ -210,10 +210,17 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
     let mut knobs: Vec<(f64, String)> = plan
         .knobs
         .iter()
-        .filter(|(knob, _)| plan.effects.iter().any(|e| e.name == knob.effect && e.processes.contains(&eased)))
         .filter_map(|(knob, value)| {
+            // the front is of the stage that the knob turns, and that is a part of the loop's turn
+            let (_, stage) = knob.stage.filter(|(process, _)| *process == eased)?;
+            // frames that are drawn coarsely already gain nothing by it
+            if stage == "ray casting" && l.coarse_share > OFTEN {
+                return None;
+            }
             let points: Vec<FrontPoint> = fronts.of(knob.name)?;
-            let saves = time_at(&points, knob.defaults[0])? / time_at(&points, *value)?;
+            let ratio = time_at(&points, knob.defaults[0])? / time_at(&points, *value)?;
+            let part = if eased == l.process { l.stages.iter().find(|s| s.stage == stage)?.us / l.p50_us } else { 1.0 };
+            let saves = 1.0 - part.min(1.0) * (1.0 - ratio);
             (saves < WORTH).then(|| (saves, format!("`{}` = {} ({:.0} % of the time)", knob.name, knob.defaults[0], 100.0 * saves)))
         })
         .collect();

@@ -79,7 +79,7 @@ fn serve<W: Stopwatch>(domain: &Domain, mut life: Life, scene: &Scene, reader: &
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
     let mut tick = tick::Loop::new(domain, scene, reader, patient, outbox, publisher.thread().clone(), watch)?;
 
-    let notices = enter_realtime(scene.haptic.priority.clamp(1, 99) as i32, scene.haptic.cpu);
+    let notices = enter_realtime(scene.haptic.priority.min(99) as i32, scene.haptic.cpu);
     for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {
         eprintln!("maille-haptic: {notice}");
         life.cell().count(Counter::NotRealtime, 1);

@@ -126,7 +126,7 @@ fn frames<W: Stopwatch + Send>(
             continue;
         }
         let missed = (now - next) / period_ns;
-        next = if missed > 0 { now + period_ns } else { next + period_ns };
+        next += (missed + 1) * period_ns;
         if !view.listen(life.control()) {
             life.cell().count(Counter::Refused, 1);
         }
@@ -207,7 +207,10 @@ fn frames<W: Stopwatch + Send>(
         if !life.record(now, monotonic_ns() - now, None) {
             continue;
         }
-        life.cell().count(Counter::KnobsNs, composer.view_ns + if breather.is_some() { warp_ns } else { 0 });
+        life.cell().count(Counter::ViewNs, composer.view_ns);
+        if breather.is_some() {
+            life.cell().count(Counter::WarpNs, warp_ns);
+        }
         if was_drawing {
             life.cell().count(Counter::Overruns, missed);
         }

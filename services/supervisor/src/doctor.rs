@@ -48,7 +48,12 @@ pub fn examine() -> Vec<Finding> {
     findings.push(locked_memory());
     findings.push(processes());
     findings.push(runs());
-    findings.push(finding("GPU", Verdict::Good, "not used by this version: rays are cast on the CPU", ""));
+    findings.push(finding(
+        "GPU",
+        Verdict::Good,
+        "asked for by scenes with `rendering.backend = \"gpu\"` alone: without one, or without a driver for Vulkan, the CPU draws the same",
+        "",
+    ));
     findings.push(finding("page", Verdict::Good, "any browser on this machine shows it; none is needed to run (--headless)", ""));
     findings
 }

@@ -4,6 +4,7 @@
 
 use crate::SupervisorError;
 use maille_governor::FrontPoint;
+use maille_scene::registry;
 use serde::Deserialize;
 use std::{fs, path::Path};
 
@@ -54,6 +55,16 @@ impl Fronts {
         let read: Self = serde_json::from_str(&text).map_err(|e| {
             SupervisorError::Refused(format!("{source} holds no fronts ({e}); `maille tradeoff --quick -o DIR` writes DIR/fronts.json"))
         })?;
+        if let Some(name) = read.fronts.iter().filter_map(|f| f.knob.as_deref()).find(|name| registry::knob(name).is_none()) {
+            return Err(SupervisorError::Refused(format!(
+                "{source} has a front of {name:?}, which is no knob of a scene: `maille tradeoff` writes their names"
+            )));
+        }
+        if !read.fronts.iter().any(|f| f.knob.as_deref().is_some_and(|name| registry::live_knob(name).is_some())) {
+            return Err(SupervisorError::Refused(format!(
+                "{source} has a front of no knob that turns in a run: `maille tradeoff --quick -o DIR` writes DIR/fronts.json with all"
+            )));
+        }
         Ok(Self { source, ..read })
     }
 
@@ -86,7 +97,8 @@ mod tests {
     #[test]
     fn what_is_no_file_of_fronts_is_refused_with_the_command_that_makes_one() {
         let path = std::env::temp_dir().join(format!("maille-fronts-{}.json", std::process::id()));
-        for text in ["", "{}", "{\"fronts\": [{\"points\": [{\"value\": null}]}]}"] {
+        let misspelt = "{\"fronts\": [{\"knob\": \"rendering.stepp\", \"points\": []}]}";
+        for text in ["", "{}", "{\"fronts\": []}", misspelt, "{\"fronts\": [{\"points\": [{\"value\": null}]}]}"] {
             fs::write(&path, text).unwrap();
             let said = Fronts::open(Some(&path)).unwrap_err().to_string();
             assert!(said.contains("maille tradeoff") && said.contains("fronts"), "{said}");

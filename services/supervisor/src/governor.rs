@@ -16,7 +16,7 @@ use crate::fronts::Fronts;
 use bytemuck::Zeroable as _;
 use loads::{Blame, Busy, Turns};
 use maille_contract::{ControlBlock, KnobState, Role};
-use maille_governor::{FrontPoint, Governor, Ladder, Load, Loop, MARKED, PRESSED, Turn, error_at, time_at};
+use maille_governor::{FrontPoint, Governor, Ladder, Load, Loop, MARKED, PRESSED, Part, Turn, error_at, time_at};
 use maille_scene::{
     Process, Scene,
     registry::{LIVE_KNOBS, knob},
@@ -122,7 +122,8 @@ pub fn ladder(scene: &Scene, fronts: &Fronts) -> Ladder {
         if between.iter().all(|p| p.value != own) {
             between.push(FrontPoint { value: own, time: start.1, error: start.0 });
         }
-        ladder = ladder.then(name, of, own, f64::INFINITY, &between);
+        let part = if name.starts_with("breathing") { Part::Warp } else { Part::View };
+        ladder = ladder.then(name, of, part, own, f64::INFINITY, &between);
     }
     ladder
 }
@@ -176,7 +177,7 @@ impl Pilot {
         let loads: Vec<Load> = self
             .busy
             .iter()
-            .filter_map(|b| b.load(now_ns))
+            .filter_map(|b| b.load(control, now_ns))
             // who rests takes nothing from the hand
             .map(|seen| if seen.of == Loop::Rendering && seen.load > 0.0 { Load { load: seen.load.max(pressed), ..seen } } else { seen })
             .collect();

@@ -68,6 +68,14 @@ pub struct Measure {
     pub processes: f64,
 }
 
+impl fmt::Display for Pair {
+    /// With its sign, as a difference; a dash where there was nothing to time.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let text = if self.p50.is_nan() { "–".to_owned() } else { format!("{:+.1}, {:+.1}", self.p50, self.p99) };
+        f.pad(&text)
+    }
+}
+
 impl Measure {
     /// Every number of two measures through a function.
     fn with(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
@@ -95,14 +103,17 @@ impl Measure {
         }
     }
 
-    /// From the JSON of a run's report; what a run has no process for is nought.
+    /// From the JSON of a run's report; what a run has no process for is nought, and the time of a step is none (NaN) where the process made no step.
     fn of(report: &serde_json::Value) -> Self {
         let n = |path: &str| report.pointer(path).and_then(serde_json::Value::as_f64).unwrap_or(0.0);
         let pair = |path: &str| Pair { p50: n(&format!("{path}/p50")), p99: n(&format!("{path}/p99")) };
         let services = report["services"].as_object();
         Self {
             tick_us: pair("/services/haptic/tick_us"),
-            step_us: pair("/services/deformation/step_us"),
+            step_us: match report.pointer("/services/deformation/commits").and_then(serde_json::Value::as_u64) {
+                Some(0) => Pair { p50: f64::NAN, p99: f64::NAN },
+                _ => pair("/services/deformation/step_us"),
+            },
             frame_ms: pair("/services/rendering/frame_ms"),
             segments_mib: n("/store/segment_mib"),
             private_mib: services.map_or(0.0, |s| s.values().filter_map(|s| s["private_mib"].as_f64()).sum()),
@@ -216,6 +227,16 @@ fn prepare(scene: &mut Scene, name: &str) {
     }
 }
 
+/// The tool of an effect that is of another kind than the base scene's.
+fn own_tool(name: &str) -> Option<&'static str> {
+    match name {
+        "cutting" => Some("a blade"),
+        "incision" => Some("one that takes tissue away"),
+        "needle" | "needle-drag" => Some("a needle"),
+        _ => None,
+    }
+}
+
 /// An effect and all it depends on, `view` and what every scene has left out.
 fn closure(name: &str) -> BTreeSet<&'static str> {
     let mut all = BTreeSet::new();
@@ -294,7 +315,7 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
     let known: Vec<&'static Effect> = EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always).collect();
     if let Some(name) = options.only.iter().find(|n| !known.iter().any(|e| e.name == **n)) {
         let names = known.iter().map(|e| e.name).collect::<Vec<_>>().join(", ");
-        return Err(TradeoffError::Run(format!("no effect is named {name:?}; there are {names}")));
+        return Err(TradeoffError::Unknown { what: "effect", name: name.clone(), known: names });
     }
     let looked_at = |e: &&&Effect| options.only.is_empty() || options.only.iter().any(|n| n == e.name);
     let nothing = BTreeSet::new();
@@ -312,6 +333,12 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
         } else if let Some(fault) = fault(&scene_of(&base, &with)) {
             notes.insert(e.name.into(), format!("this scene cannot have it: {fault}"));
         } else {
+            if let Some(kind) = own_tool(e.name) {
+                notes.insert(
+                    e.name.into(),
+                    format!("its tool is {kind}: steps are not those of a push, and what is added to them says nothing"),
+                );
+            }
             // all together: as long as the scene takes them
             let union: BTreeSet<&str> = everything.union(&with).copied().collect();
             if fault_free(&base, &union) {
@@ -329,9 +356,12 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
         }
     }
 
+    // a note says why an effect cannot be run, or of one that is what to make of it
+    let runs =
+        |name: &str| name == "everything" || own_tool(name).is_some_and(|_| fault_free(&base, &closure(name))) || !notes.contains_key(name);
     let mut sets: Vec<BTreeSet<&str>> = Vec::new();
     for (name, with, without) in &wanted {
-        if name == "everything" || !notes.contains_key(name) {
+        if runs(name) {
             for set in [without, with] {
                 if !sets.contains(set) {
                     sets.push(set.clone());
@@ -352,7 +382,7 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
             processes[n] = report["services"].as_object().map(|s| s.keys().cloned().collect()).unwrap_or_default();
         }
     }
-    let runs: Vec<Run> = sets
+    let all_runs: Vec<Run> = sets
         .iter()
         .zip(&measured)
         .zip(processes)
@@ -363,13 +393,14 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
         .into_iter()
         .map(|(effect, with, without)| {
             // differences within a round, then their median
-            let both = place(&with).zip(place(&without)).filter(|_| effect == "everything" || !notes.contains_key(&effect));
+            let both = place(&with).zip(place(&without)).filter(|_| runs(&effect));
             let added = both.map(|(a, b)| {
                 let each: Vec<Measure> = measured[a].iter().zip(&measured[b]).map(|(a, b)| a.with(*b, |a, b| a - b)).collect();
                 Measure::median(&each)
             });
-            let processes_added =
-                both.map_or(Vec::new(), |(a, b)| runs[a].processes.iter().filter(|p| !runs[b].processes.contains(p)).cloned().collect());
+            let processes_added = both.map_or(Vec::new(), |(a, b)| {
+                all_runs[a].processes.iter().filter(|p| !all_runs[b].processes.contains(p)).cloned().collect()
+            });
             let over = std::iter::once("view").chain(without).map(Into::into).collect();
             let note = notes.get(&effect).cloned();
             Added { effect, over, added, processes_added, note }
@@ -386,7 +417,7 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
         load_1m: load_1m(),
         command: command(options),
         effects,
-        runs,
+        runs: all_runs,
     })
 }
 
@@ -489,12 +520,11 @@ impl EffectsReport {
             let cells = e.added.as_ref().map_or_else(
                 || format!("{} | | | | |", e.note.as_deref().unwrap_or("not measured")),
                 |a| {
-                    let pair = |p: &Pair| format!("{:+.1}, {:+.1}", p.p50, p.p99);
                     format!(
                         "{} | {} | {} | {:+.1} | {:+.1} | {}",
-                        pair(&a.tick_us),
-                        pair(&a.step_us),
-                        pair(&a.frame_ms),
+                        a.tick_us,
+                        a.step_us,
+                        a.frame_ms,
                         a.segments_mib,
                         a.private_mib,
                         e.processes_added.join(", ")
@@ -524,14 +554,13 @@ impl fmt::Display for EffectsReport {
             match &e.added {
                 None => writeln!(f, "{:<15} {}", e.effect, e.note.as_deref().unwrap_or("not measured"))?,
                 Some(a) => {
-                    let pair = |p: &Pair| format!("{:+.1}, {:+.1}", p.p50, p.p99);
                     writeln!(
                         f,
                         "{:<15} {:>17} {:>19} {:>17} {:>10} {:>11}  {}; {}{}",
                         e.effect,
-                        pair(&a.tick_us),
-                        pair(&a.step_us),
-                        pair(&a.frame_ms),
+                        a.tick_us,
+                        a.step_us,
+                        a.frame_ms,
                         format!("{:+.1}", a.segments_mib),
                         format!("{:+.1}", a.private_mib),
                         if e.processes_added.is_empty() { "none".into() } else { e.processes_added.join(", ") },

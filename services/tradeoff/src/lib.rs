@@ -40,8 +40,8 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[allow(missing_docs)] // the sentences say it
 pub enum TradeoffError {
-    #[error("no curve is named {name:?}; there are {known}")]
-    Unknown { name: String, known: String },
+    #[error("no {what} is named {name:?}; there are {known}")]
+    Unknown { what: &'static str, name: String, known: String },
     #[error("{0}")]
     Volume(String),
     #[error("the bench of {0} could not be set up: {1}")]
@@ -80,7 +80,7 @@ pub fn chosen(only: &[String]) -> Result<Vec<&'static Curve>, TradeoffError> {
         |curve: &Curve, name: &String| curve.name == name || curve.engine == name || (!name.is_empty() && curve.name.starts_with(name));
     if let Some(name) = only.iter().find(|name| !curves().any(|c| fits(c, name))) {
         let known = curves().map(|c| c.name).collect::<Vec<_>>().join(", ");
-        return Err(TradeoffError::Unknown { name: name.clone(), known });
+        return Err(TradeoffError::Unknown { what: "curve", name: name.clone(), known });
     }
     Ok(curves().filter(|c| only.is_empty() || only.iter().any(|name| fits(c, name))).collect())
 }

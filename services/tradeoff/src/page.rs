@@ -160,7 +160,13 @@ pub(crate) fn effects(report: &EffectsReport) -> String {
     body += &effects_table(report);
     body += "</div><div class=\"charts\">";
     let rows = |of: fn(&Measure) -> (f64, Option<f64>)| -> Vec<(String, f64, Option<f64>)> {
-        report.effects.iter().filter_map(|e| e.added.as_ref().map(|a| (e.effect.clone(), of(a)))).map(|(n, (v, u))| (n, v, u)).collect()
+        report
+            .effects
+            .iter()
+            .filter_map(|e| e.added.as_ref().map(|a| (e.effect.clone(), of(a))))
+            .filter(|(_, (v, _))| !v.is_nan())
+            .map(|(n, (v, u))| (n, v, u))
+            .collect()
     };
     for (title, unit, of) in [
         ("a tick, added (p50)", "µs", (|m: &Measure| (m.tick_us.p50, Some(m.tick_us.p99))) as fn(&Measure) -> (f64, Option<f64>)),
@@ -193,7 +199,8 @@ fn effects_table(report: &EffectsReport) -> String {
                 let _ = write!(out, "<td colspan=\"6\">{}</td></tr>", escaped(e.note.as_deref().unwrap_or("not measured")));
             }
             Some(a) => {
-                let pair = |p: &crate::effects::Pair| format!("{}, {}", signed(p.p50), signed(p.p99));
+                let pair =
+                    |p: &crate::effects::Pair| if p.p50.is_nan() { "–".into() } else { format!("{}, {}", signed(p.p50), signed(p.p99)) };
                 let _ = write!(
                     out,
                     "<td class=\"n\">{}</td><td class=\"n\">{}</td><td class=\"n\">{}</td><td class=\"n\">{}</td><td class=\"n\">{}</td><td>{}</td></tr>",
@@ -204,6 +211,9 @@ fn effects_table(report: &EffectsReport) -> String {
                     signed(a.private_mib),
                     escaped(&e.processes_added.join(", "))
                 );
+                if let Some(note) = &e.note {
+                    let _ = write!(out, "<tr class=\"dim\"><td></td><td colspan=\"7\">{}</td></tr>", escaped(note));
+                }
             }
         }
     }
@@ -217,7 +227,7 @@ fn runs_table(report: &EffectsReport) -> String {
     );
     for run in &report.runs {
         let pair = |p: &crate::effects::Pair| {
-            if p.p50 == 0.0 && p.p99 == 0.0 { "–".into() } else { format!("{}, {}", number(p.p50), number(p.p99)) }
+            if p.p50.is_nan() || p.p50 == 0.0 && p.p99 == 0.0 { "–".into() } else { format!("{}, {}", number(p.p50), number(p.p99)) }
         };
         let m = &run.measure;
         let on = if run.effects.is_empty() { "view".into() } else { format!("view + {}", run.effects.join(" + ")) };

@@ -123,8 +123,10 @@ pub enum Counter {
     NoPatch = 20,
     /// loads of the smooth function's neighbourhood: the tip moved on, or tissue under it was rewritten (haptic)
     SmoothLoads = 21,
-    /// nanoseconds of `duration` in what knobs that turn live act on: the 3D view and its warp (rendering)
-    KnobsNs = 22,
+    /// nanoseconds of `duration` in the 3D view (rendering)
+    ViewNs = 22,
+    /// nanoseconds of `duration` in the warp of a patient who breathes (rendering)
+    WarpNs = 30,
     /// jumps of the device (haptic); this and the following are the contact's faults, each with its declared answer
     Jumps = 23,
     /// ticks with a pose that was not finite or not vouched for (haptic)

@@ -1,6 +1,6 @@
 //! What may be given up, in order: from measured fronts of error against time.
 
-use crate::Loop;
+use crate::{Loop, Part};
 
 /// One setting of a knob as it was measured.
 #[derive(Clone, Debug, PartialEq)]
@@ -20,11 +20,13 @@ pub struct Rung {
     pub knob: String,
     /// the loop that it relieves
     pub of: Loop,
+    /// and what of its turns
+    pub part: Part,
     /// setting above
     pub finer: f64,
     /// setting below
     pub coarser: f64,
-    /// time of a turn below over that above, between 0 and 1
+    /// time of that part below over that above, between 0 and 1
     pub saves: f64,
     /// what it costs: error below, in the knob's own unit
     pub error: f64,
@@ -81,7 +83,7 @@ impl Ladder {
     /// Points that others beat in both error and time, or that are no numbers, are left out; so are steps that save next to nothing. Where
     /// `from` itself was not measured, its time and error are taken straight between its neighbours; outside what was measured there is no rung.
     #[must_use]
-    pub fn then(mut self, knob: &str, of: Loop, from: f64, most: f64, points: &[FrontPoint]) -> Self {
+    pub fn then(mut self, knob: &str, of: Loop, part: Part, from: f64, most: f64, points: &[FrontPoint]) -> Self {
         let sound = |p: &&FrontPoint| p.value.is_finite() && p.time.is_finite() && p.time > 0.0 && p.error.is_finite();
         let start = at(from, points.iter().filter(sound));
         let mut front: Vec<&FrontPoint> = points.iter().filter(sound).filter(|p| p.value != from).chain(&start).collect();
@@ -96,7 +98,7 @@ impl Ladder {
             if saves > WORTH {
                 continue;
             }
-            self.rungs.push(Rung { knob: knob.into(), of, finer: above.value, coarser: below.value, saves, error: below.error });
+            self.rungs.push(Rung { knob: knob.into(), of, part, finer: above.value, coarser: below.value, saves, error: below.error });
             above = below;
         }
         self

@@ -30,6 +30,28 @@ pub enum Loop {
     Rendering,
 }
 
+/// Part of a turn that a knob acts on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// the 3D view of a frame; all of a step
+    View,
+    /// what a breathing patient's warp takes of a frame
+    Warp,
+}
+
+/// Shares of a turn's time, between 0 and 1 together; on the rest no knob acts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(missing_docs)] // their names
+pub struct Shares {
+    pub view: f64,
+    pub warp: f64,
+}
+
+impl Shares {
+    /// All of it is the view.
+    pub const ALL: Self = Self { view: 1.0, warp: 0.0 };
+}
+
 /// What was seen of a loop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Load {
@@ -37,23 +59,29 @@ pub struct Load {
     pub of: Loop,
     /// time of a turn over what there is for it
     pub load: f64,
-    /// share of that time on which no knob acts, 0 to 1
-    pub fixed: f64,
+    /// whose that time is
+    pub shares: Shares,
 }
 
 impl Load {
     /// All of it is in the knobs' hands.
     pub fn new(of: Loop, load: f64) -> Self {
-        Self { of, load, fixed: 0.0 }
+        Self { of, load, shares: Shares::ALL }
     }
 
-    /// What it would be where the knobs' part took `1 / saves` times as long.
-    fn without(self, saves: f64) -> f64 {
-        self.load * (self.fixed + (1.0 - self.fixed) / saves)
+    /// What it would be without these rungs.
+    fn without<'a>(self, rungs: impl Iterator<Item = &'a Rung>) -> f64 {
+        let Shares { mut view, mut warp } = self.shares;
+        let fixed = 1.0 - view - warp;
+        for rung in rungs {
+            *(if rung.part == Part::Warp { &mut warp } else { &mut view }) /= rung.saves;
+        }
+        self.load * (fixed + view + warp)
     }
 
     fn is_sound(&self) -> bool {
-        self.load.is_finite() && self.load >= 0.0 && (0.0..=1.0).contains(&self.fixed)
+        let Shares { view, warp } = self.shares;
+        self.load.is_finite() && self.load >= 0.0 && view >= 0.0 && warp >= 0.0 && view + warp <= 1.0 + 1e-9
     }
 }
 
@@ -121,13 +149,13 @@ impl Watch {
 
     /// What a load would be with nothing given up, by the fronts.
     fn whole(&self, load: Load, rungs: &[Rung]) -> f64 {
-        load.without(self.taken.iter().map(|&n| rungs[n].saves).product())
+        load.without(self.taken.iter().map(|&n| &rungs[n]))
     }
 
     /// Takes in a load that was seen for `dt_s`.
     fn see(&mut self, load: Load, dt_s: f64, rungs: &[Rung]) {
         let weight = |beyond: f64| (beyond / MARKED).min(FASTEST) * dt_s;
-        let expected = self.taken.last().map(|&n| load.without(rungs[n].saves));
+        let expected = self.taken.last().map(|&n| load.without(std::iter::once(&rungs[n])));
         self.pressed_s = if load.load > PRESSED { self.pressed_s + weight(load.load - PRESSED) } else { 0.0 };
         self.calm_s = match expected {
             // a climb that was wrong costs less than a picture that stays coarse: half the distance counts as much
@@ -219,7 +247,7 @@ impl Governor {
             let Some(last) = watch.taken.pop() else { continue };
             watch.trial = Some((0.0, before));
             let rung = &rungs[last];
-            let load = load.without(rung.saves);
+            let load = load.without(std::iter::once(rung));
             return Some(Turn { knob: rung.knob.clone(), value: rung.finer, of: watch.of, coarser: false, load });
         }
         None

@@ -13,9 +13,9 @@ fn ladder() -> Ladder {
     let end = points(&[(0.999, 1.05, 0.001), (0.99, 1.0, 0.01), (0.95, 0.9, 0.05)]);
     let sampling = points(&[(3.0, 1.5, 0.01), (1.0, 1.0, 0.2)]);
     Ladder::new()
-        .then("rendering.step", Loop::Rendering, 1.0, 1.0, &step)
-        .then("rendering.opacity_end", Loop::Rendering, 0.99, 0.1, &end)
-        .then("deformation.sampling_order", Loop::Deformation, 3.0, 1.0, &sampling)
+        .then("rendering.step", Loop::Rendering, Part::View, 1.0, 1.0, &step)
+        .then("rendering.opacity_end", Loop::Rendering, Part::View, 0.99, 0.1, &end)
+        .then("deformation.sampling_order", Loop::Deformation, Part::View, 3.0, 1.0, &sampling)
 }
 
 /// A machine on which full quality makes these loads.
@@ -55,14 +55,14 @@ fn rungs_lie_on_the_front_below_where_one_starts_and_within_the_error_allowed() 
     // a point that another beats is no rung, nor one that is no number
     let mut bad = points(&[(1.0, 1.0, 0.2), (1.2, 0.9, 0.5), (1.5, 0.7, 0.4), (1.7, f64::NAN, 0.4), (1.8, 0.5, f64::NAN)]);
     bad.push(FrontPoint { value: f64::NAN, time: 0.1, error: 0.0 });
-    let ladder = Ladder::new().then("k", Loop::Rendering, 1.0, 1.0, &bad);
+    let ladder = Ladder::new().then("k", Loop::Rendering, Part::View, 1.0, 1.0, &bad);
     assert_eq!(ladder.rungs().iter().map(|r| r.coarser).collect::<Vec<_>>(), [1.5]);
 }
 
 #[test]
 fn a_start_between_two_settings_that_were_measured_has_the_rungs_below_it() {
     let step = points(&[(0.5, 2.0, 0.1), (1.0, 1.0, 0.2), (2.0, 0.5, 0.8)]);
-    let rungs = |from: f64| Ladder::new().then("k", Loop::Rendering, from, 1.0, &step).rungs().to_vec();
+    let rungs = |from: f64| Ladder::new().then("k", Loop::Rendering, Part::View, from, 1.0, &step).rungs().to_vec();
     let [down] = &rungs(1.5)[..] else { panic!("one step down from between the last two") };
     // half-way: 0.75 of the time
     assert!((down.finer, down.coarser) == (1.5, 2.0) && (down.saves - 0.5 / 0.75).abs() < 1e-12, "{down:?}");
@@ -156,7 +156,7 @@ fn time_on_which_no_knob_acts_keeps_no_rung() {
     let fixed = 0.5;
     let load = |governor: &Governor, full: f64| {
         let knobs = governor.given_up().fold(1.0 - fixed, |part, r| part * r.saves);
-        Load { of: Loop::Rendering, load: full * (fixed + knobs), fixed: fixed / (fixed + knobs) }
+        Load { of: Loop::Rendering, load: full * (fixed + knobs), shares: Shares { view: knobs / (fixed + knobs), warp: 0.0 } }
     };
     for full in [1.3, 0.8] {
         for _ in 0..50 {
@@ -165,8 +165,31 @@ fn time_on_which_no_knob_acts_keeps_no_rung() {
         }
         assert_eq!(governor.given_up().count() > 0, full > 1.0);
     }
-    let worse = Load { fixed: f64::NAN, ..Load::new(Loop::Rendering, 9.0) };
+    let worse = Load { shares: Shares { view: f64::NAN, warp: 0.0 }, ..Load::new(Loop::Rendering, 9.0) };
     assert!((0..50).all(|_| governor.observe(&[worse], DT_S).is_none()));
+}
+
+/// A knob that makes a small part of a frame twenty times quicker is no twenty frames when it comes back.
+#[test]
+fn a_rung_counts_for_the_part_of_a_turn_that_it_is_about() {
+    let warp = points(&[(0.1, 1.0, 0.1), (0.3, 0.04, 0.3)]);
+    let step = points(&[(1.0, 1.0, 0.2), (2.0, 0.6, 0.4)]);
+    let ladder =
+        Ladder::new().then("step", Loop::Rendering, Part::View, 1.0, 1.0, &step).then("warp", Loop::Rendering, Part::Warp, 0.1, 1.0, &warp);
+    let mut governor = Governor::new(ladder);
+    // of a frame at full settings the view is 0.8 and the warp 0.2
+    let load = |governor: &Governor, full: f64| {
+        let part = |part| governor.given_up().filter(|r| r.part == part).map(|r| r.saves).product::<f64>();
+        let (view, warp) = (0.8 * part(Part::View), 0.2 * part(Part::Warp));
+        Load { of: Loop::Rendering, load: full * (view + warp), shares: Shares { view: view / (view + warp), warp: warp / (view + warp) } }
+    };
+    for (full, left) in [(1.8, 2), (0.7, 0)] {
+        for _ in 0..50 {
+            let seen = load(&governor, full);
+            governor.observe(&[seen], DT_S);
+        }
+        assert_eq!(governor.given_up().count(), left);
+    }
 }
 
 #[test]

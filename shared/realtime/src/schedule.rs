@@ -31,8 +31,8 @@ const TIMER_SLACK_NS: c_ulong = 1;
 /// Time slice asked for where SCHED_FIFO is refused [ns]: the smallest the kernel takes.
 const SLICE_NS: u64 = 100_000;
 
-/// Makes the calling thread real-time as far as allowed: SCHED_FIFO at `priority` (held to 1–99), pinned to `cpu` if one is
-/// given, timer slack 1 ns. Threads it starts later do not inherit the class. Returns what was refused; empty when all was
+/// Makes the calling thread real-time as far as allowed: SCHED_FIFO at `priority` (at most 99; with 0 or less it stays in its class), pinned to `cpu` if one
+/// is given, timer slack 1 ns. Threads it starts later do not inherit the class. Returns what was refused; empty when all was
 /// granted.
 pub fn enter_realtime(priority: i32, cpu: Option<usize>) -> Vec<Notice> {
     let mut notices = Vec::new();
@@ -45,9 +45,9 @@ pub fn enter_realtime(priority: i32, cpu: Option<usize>) -> Vec<Notice> {
         tell(pin(cpu), &format!("the thread could not be pinned to CPU {cpu}, it runs on any; choose a CPU that `nproc` counts"));
     }
     tell(set_timer_slack(), "the timer slack could not be lowered, wake-ups come up to 50 µs late");
-    let fifo = set_fifo(priority.clamp(1, 99));
-    if fifo.is_err() {
-        // one more thing to try, and no notice of its own: the one on SCHED_FIFO says what to do
+    let fifo = if priority > 0 { set_fifo(priority.min(99)) } else { Ok(()) };
+    if fifo.is_err() || priority <= 0 {
+        // without the class, the next best thing, and no notice of its own: the one on SCHED_FIFO says what to do
         let _ = set_slice(SLICE_NS);
     }
     tell(

@@ -141,6 +141,13 @@ fn read(name: &str, text: &str) -> Result<(Scene, Document), SceneError> {
     for knob in KNOBS.iter().filter(|k| document.span(k.name).is_none()) {
         (knob.set)(&mut scene, knob.defaults[accuracy]);
     }
+    // a floor that nobody wrote lies below the rate that somebody did
+    let (d, r) = (&mut scene.deformation, &mut scene.rendering);
+    for (path, floor, rate) in [("deformation.floor_hz", &mut d.floor_hz, d.rate_hz), ("rendering.floor_hz", &mut r.floor_hz, r.rate_hz)] {
+        if document.span(path).is_none() {
+            *floor = floor.min(rate);
+        }
+    }
     let mut faults = Vec::new();
     check_numbers(&document, &scene, &mut faults);
     check_tool(&document, &scene, &mut faults);
@@ -301,7 +308,7 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     }
     let (d, r) = (&scene.deformation, &scene.rendering);
     for (path, floor, rate) in [("deformation.floor_hz", d.floor_hz, d.rate_hz), ("rendering.floor_hz", r.floor_hz, r.rate_hz)] {
-        if document.span(path).is_some() && floor > rate {
+        if floor > rate {
             let help = Some("the floor is the rate below which accuracy is given up: use a number up to rate_hz".into());
             faults.push(document.fault(path, format!("floor_hz = {floor} is above rate_hz = {rate}"), "above the rate", help));
         }

@@ -362,6 +362,8 @@ pub struct Knob {
     pub effect: &'static str,
     /// one line for a stranger
     pub summary: &'static str,
+    /// stage of a loop whose time it turns; none where it is memory, or work before the run
+    pub stage: Option<(Process, &'static str)>,
     /// value at `draft`, `balanced`, `reference`
     pub defaults: [f64; 3],
     /// what goes wrong, in a physical unit
@@ -381,6 +383,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "rendering.step",
         effect: "view",
+        stage: Some((Process::Rendering, "ray casting")),
         summary: "distance of samples along a ray, in units of the smallest spacing",
         defaults: [2.0, 1.0, 0.5],
         error: "difference of the picture [part of full scale]",
@@ -392,6 +395,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "rendering.scale",
         effect: "view",
+        stage: Some((Process::Rendering, "ray casting")),
         summary: "share of the full width and height at which the 3D view is drawn; scaled up by straight interpolation",
         defaults: [0.5, 1.0, 1.0],
         error: "difference of the picture [part of full scale]",
@@ -403,6 +407,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "rendering.opacity_end",
         effect: "view",
+        stage: Some((Process::Rendering, "ray casting")),
         summary: "a ray ends when this part of the light is used up",
         defaults: [0.95, 0.99, 0.999],
         error: "light left out, at most 1 − this [part of full scale]",
@@ -414,6 +419,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "deformation.offset",
         effect: "deformation",
+        stage: Some((Process::Deformation, "chainmail")),
         summary: "link limit as a part of the link's length: how far a dent reaches",
         defaults: [0.3, 0.2, 0.1],
         error: "distance of displacements from those of elastic tissue under the same push [mm]",
@@ -425,6 +431,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "deformation.inversion_tolerance_mm",
         effect: "deformation",
+        stage: Some((Process::Deformation, "mapper")),
         summary: "residual at which the mapper's inversion stops",
         defaults: [0.05, 0.01, 0.001],
         error: "residual |x − X − u(X)| [mm]",
@@ -436,6 +443,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "deformation.sampling_order",
         effect: "deformation",
+        stage: Some((Process::Deformation, "mapper")),
         summary: "order of the interpolation of values that are moved: 1 trilinear, 3 tricubic",
         defaults: [1.0, 1.0, 3.0],
         error: "difference of the rewritten voxels [HU RMS]",
@@ -447,6 +455,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "breathing.field_spacing_mm",
         effect: "breathing",
+        stage: None,
         summary: "distance of the nodes of the fields of breathing",
         defaults: [8.0, 5.0, 2.5],
         error: "difference of the displacement from the model's own [mm]",
@@ -458,6 +467,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "breathing.precision_bits",
         effect: "breathing",
+        stage: None,
         summary: "bits of a component of a stored vector: 16 in steps of one size, 32 single precision",
         defaults: [16.0, 16.0, 32.0],
         error: "bound on the error of a stored vector [mm]",
@@ -469,6 +479,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "breathing.inversion_tolerance_mm",
         effect: "breathing",
+        stage: Some((Process::Haptic, "world to reference")),
         summary: "residual at which a tick's inversion stops",
         defaults: [0.01, 0.001, 0.0005],
         error: "residual |x − X − u(X)| [mm], of every tick, in the report",
@@ -480,6 +491,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "breathing.picture_tolerance_mm",
         effect: "breathing",
+        stage: Some((Process::Rendering, "warp")),
         summary: "how far from its place a picture may show anything",
         defaults: [0.3, 0.1, 0.03],
         error: "residual |x − X − u(X)| of what is shown [mm], of every frame, in the report",
@@ -491,6 +503,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "deformation.metric",
         effect: "deformation",
+        stage: Some((Process::Deformation, "chainmail")),
         summary: "shape of the regions in which neighbours may move: 0 cubic, 1 round",
         defaults: [0.0, 0.0, 0.0],
         error: "distance of displacements from those of elastic tissue under the same push [mm]",
@@ -505,6 +518,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "haptic.contact_stiffness_n_per_mm",
         effect: "contact",
+        stage: None,
         summary: "stiffness of the coupling between proxy and device; lowered where the device could not render it passively",
         defaults: [0.5, 0.5, 0.5],
         error: "depth of the tip in a rigid wall that a hand presses with 1 N [mm]",
@@ -516,6 +530,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "needle.nodes",
         effect: "needle",
+        stage: Some((Process::Haptic, "needle")),
         summary: "nodes of the rod",
         defaults: [15.0, 25.0, 50.0],
         error: "place of the tip under load, of the deflection [1]",
@@ -527,6 +542,7 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "needle.path_spacing_mm",
         effect: "needle",
+        stage: Some((Process::Haptic, "needle")),
         summary: "distance of nodes of the path that the tip has cut",
         defaults: [10.0, 5.0, 2.5],
         error: "place of the path between its nodes [mm]",
@@ -578,6 +594,10 @@ mod tests {
         for knob in KNOBS {
             let limit = limit(knob.name).unwrap_or_else(|| panic!("{} has no range", knob.name));
             assert!(effect(knob.effect).is_some_and(|e| e.available), "{} belongs to no effect", knob.name);
+            if let Some((process, stage)) = knob.stage {
+                let known = EFFECTS.iter().flat_map(|e| e.stages).any(|s| s.process == process && s.name == stage);
+                assert!(known, "{} turns {stage}, which no effect has", knob.name);
+            }
             for value in knob.defaults {
                 assert!((limit.low..=limit.high).contains(&value), "{} = {value}", knob.name);
                 let mut scene = Scene::default();

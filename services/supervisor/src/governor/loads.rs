@@ -1,19 +1,21 @@
 //! What the governor looks at: time that loops spend, turns that they miss, and whose doing that is.
 
 use maille_contract::{
-    ControlBlock, Role,
+    ControlBlock, Role, ServiceState,
     control::Counter,
     histogram::{BUCKETS, lower},
 };
-use maille_governor::{Load, Loop};
-use std::collections::VecDeque;
+use maille_governor::{Load, Loop, Shares};
+use std::{collections::VecDeque, sync::atomic::Ordering::Relaxed};
 
 /// Share of the period at the floor that a turn may take: the rest is for what is not counted in it.
 pub(super) const PLANNED: f64 = 0.9;
 /// How much of a new look enters a load.
 const FOLLOW: f64 = 0.5;
-/// A loop that has not turned for so long rests: it has all the room there is [ns].
+/// A loop that has not turned for so long, and looks whether it has to, rests: it has all the room there is [ns].
 const RESTS_NS: u64 = 1_000_000_000;
+/// A loop whose heart did not beat for so long is in a turn, starved or dead [ns].
+const BEATS_NS: u64 = 200_000_000;
 /// Share of missed ticks above which the haptic loop presses others.
 pub(super) const MISSED: f64 = 0.005;
 /// Looks over which ticks and frames are counted: a second.
@@ -34,17 +36,25 @@ pub(super) struct Busy {
     /// time that there is for a turn [ns]
     there_is_ns: f64,
     counts: Vec<u64>,
-    /// time on which knobs act, where that is counted
-    knobs_ns: u64,
-    /// share of the others
-    fixed: f64,
+    /// time in the parts on which knobs act, where that is counted
+    parts_ns: [u64; 2],
+    /// and their shares
+    shares: Shares,
     /// and when it was last seen
     load: Option<(f64, u64)>,
 }
 
 impl Busy {
     pub(super) fn new(of: Loop, role: Role, floor_hz: f64) -> Self {
-        Self { of, role, there_is_ns: PLANNED * 1e9 / floor_hz, counts: vec![0; BUCKETS], knobs_ns: 0, fixed: 0.0, load: None }
+        Self {
+            of,
+            role,
+            there_is_ns: PLANNED * 1e9 / floor_hz,
+            counts: vec![0; BUCKETS],
+            parts_ns: [0; 2],
+            shares: Shares::ALL,
+            load: None,
+        }
     }
 
     pub(super) fn look(&mut self, control: &ControlBlock, now_ns: u64) {
@@ -56,23 +66,37 @@ impl Busy {
             spent_ns += new as f64 * lower(bucket) as f64;
         }
         self.counts = counts;
-        let knobs_ns = control.service(self.role).counter(Counter::KnobsNs);
-        let knobs = knobs_ns.saturating_sub(std::mem::replace(&mut self.knobs_ns, knobs_ns)) as f64;
+        let parts_ns = [Counter::ViewNs, Counter::WarpNs].map(|part| control.service(self.role).counter(part));
+        let new: [f64; 2] = std::array::from_fn(|n| parts_ns[n].saturating_sub(self.parts_ns[n]) as f64);
+        self.parts_ns = parts_ns;
         if turns > 0 {
-            if knobs > 0.0 {
-                // bounds of a histogram are not exact
-                self.fixed += FOLLOW * ((1.0 - knobs / spent_ns.max(1.0)).clamp(0.0, 1.0) - self.fixed);
+            if new[0] > 0.0 {
+                // the bounds of a histogram are not exact
+                let all = spent_ns.max(new[0] + new[1]);
+                let shares = Shares { view: new[0] / all, warp: new[1] / all };
+                let follow = |old: f64, new: f64| old + FOLLOW * (new - old);
+                self.shares = match self.load {
+                    Some(_) => Shares { view: follow(self.shares.view, shares.view), warp: follow(self.shares.warp, shares.warp) },
+                    None => shares,
+                };
             }
             let seen = spent_ns / turns as f64 / self.there_is_ns;
             self.load = Some((self.load.map_or(seen, |(load, _)| load + FOLLOW * (seen - load)), now_ns));
         }
     }
 
-    /// The load now; none before the first turn.
-    pub(super) fn load(&self, now_ns: u64) -> Option<Load> {
+    /// The load now; none before the first turn, and of a loop of which nothing is heard.
+    pub(super) fn load(&self, control: &ControlBlock, now_ns: u64) -> Option<Load> {
         let (load, at_ns) = self.load?;
-        let load = if now_ns.saturating_sub(at_ns) < RESTS_NS { load } else { 0.0 };
-        Some(Load { of: self.of, load, fixed: self.fixed })
+        let turned = now_ns.saturating_sub(at_ns) < RESTS_NS;
+        let cell = control.service(self.role);
+        let beats = cell.state() == ServiceState::Ready && now_ns.saturating_sub(cell.heartbeat_ns.load(Relaxed)) < BEATS_NS;
+        let load = match (turned, beats) {
+            (true, _) => load,
+            (false, true) => 0.0,
+            (false, false) => return None,
+        };
+        Some(Load { of: self.of, load, shares: self.shares })
     }
 }
 
