@@ -83,7 +83,7 @@ impl<'a> Breather<'a> {
         let weights = model.weights(&breath);
         self.collapsed.collapse(model, &weights);
         let (longest_mm, contraction) = self.collapsed.bounds(model);
-        self.warp.update_field(&self.info, model.grid(), &self.collapsed.displacement(), longest_mm, contraction)
+        self.warp.update_field(&self.info, model.grid(), self.collapsed.nodes(), longest_mm, contraction)
     }
 
     /// Where a point of the patient at rest is at a simulation time [mm].

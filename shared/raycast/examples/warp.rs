@@ -1,11 +1,12 @@
-//! What a warp costs and errs: a frame through a breath of three fields over the same picture baked, the bound on the error beside the error
+//! What a warp costs and errs: a frame through a breath over the same picture baked, the bound on the error beside the error
 //! itself, and the picture beside the one of the volume resampled finely.
 //!
 //! ```text
-//! cargo run --release -p maille-raycast --example warp -- VOLUME [NODES] [FINER]
+//! cargo run --release -p maille-raycast --example warp -- VOLUME [NODES] [FINER] [KEYS]
 //! ```
-//! `NODES`: nodes of the fields along each axis (64). `FINER`: voxels of the baked volume for each of the file's, along each axis (2).
-//! Times are processor time over two threads, the best of frames taken in turns: a loaded machine disturbs ratios less than times.
+//! `NODES`: nodes of the fields along each axis (64). `FINER`: voxels of the baked volume for each of the file's, along each axis (2). `KEYS`: the same
+//! breath as so many key frames instead, between which coefficients go in straight lines (0: the three fields themselves).
+//! Times are processor time over two threads, the median of frames taken in turns: a loaded machine disturbs ratios less than times.
 
 use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Step, Warp, WarpOptions, render, render_extra, resampled};
 use maille_volume::{BrickSource as _, BrickedVolume, Grid, VectorField, io::read_volume};
@@ -14,6 +15,8 @@ use std::path::Path;
 
 const SIZE: [usize; 2] = [1224, 1014];
 const ROUNDS: usize = 7;
+/// Updates, and lattices of a picture, timed together; with ROUNDS 7 more than a multiple of 14.
+const BATCH: usize = 11;
 
 /// Processor time of all threads, over two [ms].
 fn now() -> f64 {
@@ -24,42 +27,71 @@ fn now() -> f64 {
     std::fs::read_dir("/proc/self/task").expect("Linux").filter_map(of).sum::<f64>() * 0.5e-6
 }
 
+fn median(mut of: Vec<f64>) -> f64 {
+    of.sort_by(f64::total_cmp);
+    of[of.len() / 2]
+}
+
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
     let number = |n: usize, other: usize| arguments.get(n).map_or(other, |a| a.parse().expect("a whole number"));
-    let (nodes, finer) = (number(2, 64), number(3, 2));
+    let (nodes, finer, keys) = (number(2, 64), number(3, 2), number(4, 0));
     let file = arguments.get(1).expect("a volume");
     let source = BrickedVolume::from_volume(&read_volume(Path::new(file)).expect("a readable volume").0);
     let grid = source.info().grid.clone();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().expect("threads");
-    pool.install(|| compare(&source, &grid, nodes, finer));
+    pool.install(|| compare(&source, &grid, nodes, finer, keys));
 }
 
-fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
-    let motion = breath(grid, nodes);
-    let moment = |t: f32| [9.0 * t.sin(), 3.0 * t.cos(), 3.0 * (t + 0.5).sin()];
+fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize, keys: usize) {
+    let three = |t: f32| [9.0 * t.sin(), 3.0 * t.cos(), 3.0 * (t + 0.5).sin()];
+    // key frames at times 0 … 1.5
+    let apart = 1.5 / keys.saturating_sub(1).max(1) as f32;
+    let moment = |t: f32| match keys {
+        0 => three(t).to_vec(),
+        _ => (0..keys).map(|n| (1.0 - (t / apart - n as f32).abs()).max(0.0)).collect(),
+    };
+    let fields = breath(grid, nodes);
+    let key = |n: usize| {
+        let mut field = VectorField::zeros(fields[0].grid.clone());
+        for (basis, c) in fields.iter().zip(three(apart * n as f32)) {
+            field.vectors.iter_mut().zip(&basis.vectors).for_each(|(v, b)| (0..3).for_each(|i| v[i] += c * b[i]));
+        }
+        field
+    };
+    let motion = if keys == 0 { Motion::new(&fields) } else { Motion::new(&(0..keys).map(key).collect::<Vec<_>>()) };
+    let motion = motion.expect("finite fields on one grid");
+    drop(fields);
     let mut warp = Warp::new(source.info(), WarpOptions::default());
-    let mut report = warp.update(source.info(), &motion, &moment(1.2)).expect("three coefficients");
-    let (mut update, mut t) = (f64::INFINITY, 1.2);
-    for _ in 0..ROUNDS {
-        t -= 0.03;
+    let mut report = warp.update(source.info(), &motion, &moment(1.2)).expect("as many coefficients as fields");
+    // a thread's clock moves by the scheduler's ticks: what is short is done many times
+    let (mut update, mut t) = (Vec::new(), 1.2);
+    for round in 0..ROUNDS {
         let start = now();
-        report = warp.update(source.info(), &motion, &moment(t)).expect("three coefficients");
-        update = update.min(now() - start);
+        for n in round * BATCH + 1..=(round + 1) * BATCH {
+            // to and fro, 30 steps a second of a breath of six, and at its far end after the last
+            t = 1.2 - 0.03 * [0, 1, 2, 3, 4, 5, 6, 7, 6, 5, 4, 3, 2, 1][n % 14] as f32;
+            report = warp.update(source.info(), &motion, &moment(t)).expect("as many coefficients as fields");
+        }
+        update.push((now() - start) / BATCH as f64);
     }
+    let update = median(update);
     let coefficients = moment(t);
     let camera = Camera::around(source.info());
     let settings = Settings { step: Step::Millimetres(1.0), ..Settings::volume(Preset::Ct.transfer()) };
     let skip = Skip::new(source, &settings);
-    let (mut lattice, mut view_mm) = (f64::INFINITY, 0.0);
+    let (mut lattice, mut view_mm) = (Vec::new(), 0.0);
     for _ in 0..ROUNDS {
         let start = now();
-        view_mm = warp.view_error_mm(source.info(), &skip, &camera, &settings, SIZE, 0.0).expect("a sound camera");
-        lattice = lattice.min(now() - start);
+        for _ in 0..BATCH {
+            view_mm = warp.view_error_mm(source.info(), &skip, &camera, &settings, SIZE, 0.0).expect("a sound camera");
+        }
+        lattice.push((now() - start) / BATCH as f64);
     }
+    let lattice = median(lattice);
 
     // the truth: the fixed point to the last digit
-    let at = motion.moment(&coefficients).expect("three coefficients");
+    let at = motion.moment(&coefficients).expect("as many coefficients as fields");
     let rest = |x: [f64; 3]| -> [f64; 3] {
         let start = warp.rest_index(grid.index_from_world(x).map(|v| v as f32)).map(f64::from);
         let mut rest = grid.world_from_index(start);
@@ -109,9 +141,9 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
     let skip_baked = Skip::new(&baked, &settings);
     let (mut moved, mut still, mut unwarped) =
         (Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]));
-    let mut times = [f64::INFINITY; 3];
+    let mut times = [const { Vec::new() }; 3];
     for _ in 0..ROUNDS {
-        let mut time = |n: usize, start: f64| times[n] = times[n].min(now() - start);
+        let mut time = |n: usize, start: f64| times[n].push(now() - start);
         let start = now();
         let extras = Extras { warp: Some(&warp), ..Extras::default() };
         render_extra(&extras, source, &skip, &camera, &settings, &mut moved).expect("a sound camera");
@@ -123,12 +155,17 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
         render(source, &skip, &camera, &settings, &mut unwarped).expect("a sound camera");
         time(2, start);
     }
+    let times = times.map(median);
     let difference = |a: &Picture, b: &Picture| {
         a.rgb.iter().zip(&b.rgb).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / a.rgb.len() as f64 / 2.55
     };
     println!(
-        "three fields of {nodes}³: update {update:.1} ms, warped frame {:.1} ms (its own lattice {lattice:.1}), baked {:.1} ms, at rest {:.1} ms",
-        times[0], times[1], times[2]
+        "{} fields of {nodes}³, {:.0} MiB: update {update:.1} ms, warped frame {:.1} ms (its own lattice {lattice:.1}), baked {:.1} ms, at rest {:.1} ms",
+        motion.count(),
+        motion.size_bytes() as f64 / f64::from(1 << 20),
+        times[0],
+        times[1],
+        times[2]
     );
     println!(
         "with the update {:.2} times the baked frame, {:.2} times the frame at rest",
@@ -162,7 +199,7 @@ fn compare(source: &BrickedVolume, grid: &Grid, nodes: usize, finer: usize) {
 }
 
 /// Swelling, sliding and bending, fading towards the border.
-fn breath(grid: &Grid, nodes: usize) -> Motion {
+fn breath(grid: &Grid, nodes: usize) -> [VectorField; 3] {
     let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64);
     let mut own = Grid::axis_aligned([nodes; 3], extent.map(|e| e / (nodes - 1) as f64));
     (own.origin, own.direction) = (grid.origin, grid.direction);
@@ -177,10 +214,9 @@ fn breath(grid: &Grid, nodes: usize) -> Motion {
         }
         field
     };
-    Motion::new(&[
+    [
         field(|_, f| [0.0, 0.3 * f, f]),
         field(|t, f| [f * (2.0 * t[2]).sin(), f, 0.0]),
         field(|t, f| [f * t[0], f * t[1], f * (2.0 * t[1]).cos()]),
-    ])
-    .expect("finite fields on one grid")
+    ]
 }

@@ -18,6 +18,7 @@ mod bend;
 mod field;
 mod lattice;
 mod reference;
+mod settle;
 mod tile;
 mod view;
 

@@ -141,6 +141,11 @@ impl Collapsed {
         Steps { shape: &self.shape, nodes: &self.forward, scale: self.forward_scale }
     }
 
+    /// The nodes of the last moment's u, i fastest, and what a step of theirs is worth [index units of the model's grid].
+    pub fn nodes(&self) -> (&[[i16; 4]], f32) {
+        (&self.forward, self.forward_scale)
+    }
+
     /// Length of the longest vector of u [mm], and a bound on its contraction in the max norm of millimetres along the grid's axes: the largest row sum of
     /// |∂u_c/∂X_d| in any cell. Of the sum itself, where [`MotionModel::bounds`] adds up those of its terms.
     pub fn bounds(&self, _model: &MotionModel) -> (f32, f32) {

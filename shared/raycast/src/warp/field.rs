@@ -7,7 +7,11 @@
 //! Units: index units of the field's own grid. Cost: a collapse reads 8 bytes a node and basis; where a lattice asks for fewer
 //! values than the field has nodes, the sum is formed at the corners that are asked for instead.
 
-use maille_displacement::RowField;
+use super::settle::Sum;
+use maille_displacement::{
+    Nodes, RowField,
+    quads::{self, Quads},
+};
 use maille_volume::{Grid, VectorField};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -32,6 +36,9 @@ pub enum WarpError {
         needed: usize,
     },
 }
+
+/// Nodes summed up at once.
+const CHUNK: usize = 1 << 14;
 
 /// Basis fields of a motion.
 #[derive(Clone, Debug)]
@@ -107,27 +114,28 @@ impl Motion {
         (sum(|b| b.longest_mm), sum(|b| b.contraction))
     }
 
+    /// What adds to the sum: of key frames the two on either side.
+    fn terms<'a, 'c>(&'a self, coefficients: &'c [f32]) -> impl Iterator<Item = (&'a Basis, f32)> + use<'a, 'c> {
+        self.bases.iter().zip(coefficients.iter().copied()).filter(|(_, c)| *c != 0.0)
+    }
+
     /// The sum under coefficients, formed where it is asked for.
     pub(super) fn lazy<'a>(&'a self, coefficients: &[f32]) -> Lazy<'a> {
-        let terms = self.bases.iter().zip(coefficients).map(|(b, c)| (b.nodes.as_slice(), f32x4::splat(b.scale * c))).collect();
+        let terms = self.terms(coefficients).map(|(b, c)| (Nodes::new(&b.nodes, self.grid.size), b.scale * c)).collect();
         Lazy { shape: Shape::new(&self.grid), terms }
     }
 
-    /// The sum under coefficients at all nodes, into memory that is kept.
-    pub(super) fn collapse<'a>(&self, coefficients: &[f32], into: &'a mut Vec<f32x4>) -> Whole<'a> {
-        let lazy = self.lazy(coefficients);
-        into.resize(self.grid.voxel_count(), f32x4::ZERO);
-        into.par_chunks_mut(1 << 14).enumerate().for_each(|(chunk, out)| {
-            let first = chunk << 14;
-            // one basis after the other: each is read in one stream
-            for (n, (nodes, scale)) in lazy.terms.iter().enumerate() {
-                for (out, node) in out.iter_mut().zip(&nodes[first..]) {
-                    let term = numbers(*node) * *scale;
-                    *out = if n == 0 { term } else { *out + term };
-                }
-            }
+    /// The sum under coefficients at all nodes, into memory that is kept: again whole numbers of 16 bits.
+    pub(super) fn collapse<'a>(&self, coefficients: &[f32], into: &'a mut Vec<[i16; 4]>) -> Lazy<'a> {
+        let most: f32 = self.terms(coefficients).map(|(b, c)| 32_767.0 * (b.scale * c).abs()).sum();
+        let scale = (most / 32_000.0).max(f32::MIN_POSITIVE);
+        into.resize(self.grid.voxel_count(), [0; 4]);
+        into.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
+            let (from, to) = (chunk * CHUNK, chunk * CHUNK + out.len());
+            let terms: Vec<_> = self.terms(coefficients).map(|(b, c)| (&b.nodes[from..to], b.scale * c / scale)).collect();
+            quads::run(Sum { terms: &terms, out });
         });
-        Whole { shape: lazy.shape, nodes: into }
+        Lazy::one(&self.grid, into, scale)
     }
 }
 
@@ -246,7 +254,15 @@ impl Moment<'_> {
 /// A motion under coefficients, summed where it is asked for.
 pub(super) struct Lazy<'a> {
     shape: Shape,
-    terms: Vec<(&'a [[i16; 4]], f32x4)>,
+    /// nodes, and what a step of theirs is worth [index]
+    terms: Vec<(Nodes<'a, i16>, f32)>,
+}
+
+impl<'a> Lazy<'a> {
+    /// A field by itself.
+    pub fn one(grid: &Grid, nodes: &'a [[i16; 4]], scale: f32) -> Self {
+        Self { shape: Shape::new(grid), terms: vec![(Nodes::new(nodes, grid.size), scale)] }
+    }
 }
 
 impl Lazy<'_> {
@@ -254,7 +270,17 @@ impl Lazy<'_> {
     fn node(&self, at: usize) -> f32x4 {
         let mut sum = f32x4::ZERO;
         for (nodes, scale) in &self.terms {
-            sum += numbers(nodes[at]) * *scale;
+            sum += numbers(nodes.all()[at]) * f32x4::splat(*scale);
+        }
+        sum
+    }
+
+    /// u at four places, each node + v.
+    #[inline(always)]
+    pub fn four<Q: Quads>(&self, q: Q, node: Q::V, v: Q::V) -> Q::V {
+        let mut sum = q.splat(0.0);
+        for (nodes, scale) in &self.terms {
+            sum = q.fma(nodes.value(q, node, v), q.splat(*scale), sum);
         }
         sum
     }
@@ -268,22 +294,5 @@ impl RowField for Lazy<'_> {
     #[inline]
     fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]) {
         blend_with_slopes(&self.shape, index, |at| self.node(at))
-    }
-}
-
-/// A motion under coefficients at every node.
-pub(super) struct Whole<'a> {
-    shape: Shape,
-    nodes: &'a [f32x4],
-}
-
-impl RowField for Whole<'_> {
-    #[inline]
-    fn value(&self, index: f32x4) -> f32x4 {
-        blend(&self.shape, index, |at| self.nodes[at])
-    }
-    #[inline]
-    fn jet(&self, index: f32x4) -> (f32x4, [f32x4; 3]) {
-        blend_with_slopes(&self.shape, index, |at| self.nodes[at])
     }
 }

@@ -3,7 +3,8 @@
 //! Nodes lie `pitch` apart in the volume's index space, from a margin below the volume to one above it. The lattice is
 //! refined, up to `finest`, while its error is above the tolerance.
 
-use super::field::{Lazy, Motion, WarpError, Whole};
+use super::field::{Lazy, Motion, WarpError};
+use super::settle::{Lay, Residual, Settle};
 use crate::twin::Lattice;
 use maille_displacement::quads::{self, Quads, Task};
 use maille_displacement::{Inverter, RowField, Scheme};
@@ -44,8 +45,10 @@ pub struct WarpReport {
     pub nodes: usize,
 }
 
-/// Nodes inverted at once.
-const ROW: usize = 16;
+/// Contraction from which on it says nothing.
+const LARGEST: f32 = 0.95;
+/// Nodes of a field that are summed up in one stream while u is looked at for one node of the lattice and one cell, in memory anywhere.
+const SCATTERED: usize = 32;
 /// Most nodes of a lattice (64 MiB): one that would have more, since matter leaves the volume by many times its size, is coarser, and says so
 /// in its error.
 const MOST_NODES: f64 = (4 << 20) as f64;
@@ -63,12 +66,14 @@ pub struct Warp {
     /// its inverse
     per_pitch: [f32; 3],
     counts: [usize; 3],
-    /// v [index]
+    /// v [index], and the one before
     nodes: Vec<f32x4>,
+    before: Vec<f32x4>,
     /// how far matter may leave the volume [index]
     margin: [f32; 3],
-    collapsed: Vec<f32x4>,
-    warm: bool,
+    collapsed: Vec<[i16; 4]>,
+    /// moments of v that are known
+    known: u8,
 }
 
 impl Warp {
@@ -83,9 +88,10 @@ impl Warp {
             per_pitch: [1.0; 3],
             counts: [0; 3],
             nodes: Vec::new(),
+            before: Vec::new(),
             margin: [0.0; 3],
             collapsed: Vec::new(),
-            warm: false,
+            known: 0,
         }
     }
 
@@ -130,31 +136,33 @@ impl Warp {
         self.lay_out(longest_mm);
         let frames = Frames::new(info, motion.grid());
         let field_nodes = motion.grid().voxel_count();
-        // two evaluations a node and one a cell, eight corners each, spare a sum each; to form all sums is one stream, four times as fast a node
-        let (spared, all) = (24 * self.nodes.len() * (motion.count() - 1), field_nodes * (motion.count() + 1) / 4);
-        if all > spared {
-            let field = motion.lazy(coefficients);
-            return Ok(self.invert(&frames, &field as &Lazy<'_>, motion.grid(), contraction));
+        // one evaluation a node and one a cell, or few more, of scattered lines of memory for every term, where to form all sums is one stream
+        let terms = coefficients.iter().filter(|c| **c != 0.0).count();
+        let (scattered, all) = (SCATTERED * self.nodes.len() * terms, field_nodes * (terms + 1));
+        if all > scattered {
+            return Ok(self.invert(&frames, &motion.lazy(coefficients), motion.grid(), contraction));
         }
         let mut memory = std::mem::take(&mut self.collapsed);
-        let field = motion.collapse(coefficients, &mut memory);
-        let report = self.invert(&frames, &field as &Whole<'_>, motion.grid(), contraction);
+        let report = self.invert(&frames, &motion.collapse(coefficients, &mut memory), motion.grid(), contraction);
         self.collapsed = memory;
         Ok(report)
     }
 
-    /// The inverse of somebody else's field, where it lies: in index units of `grid`, no vector longer than `longest_mm`, of this contraction along
-    /// the grid's axes in millimetres. Numbers that are not finite end in nodes that are not settled, and are counted.
+    /// The inverse of somebody else's field, where it lies: whole numbers of 16 bits at the nodes of `grid`, a step of which is `scale` of its index units; no
+    /// vector longer than `longest_mm`, of this contraction along the grid's axes in millimetres.
+    ///
+    /// # Panics
+    /// When there are not as many nodes as the grid has.
     pub fn update_field(
         &mut self,
         info: &VolumeInfo,
         grid: &Grid,
-        field: &(impl RowField + Sync),
+        (nodes, scale): (&[[i16; 4]], f32),
         longest_mm: f32,
         contraction: f32,
     ) -> WarpReport {
         self.lay_out(longest_mm);
-        self.invert(&Frames::new(info, grid), field, grid, contraction)
+        self.invert(&Frames::new(info, grid), &Lazy::one(grid, nodes, scale), grid, contraction)
     }
 
     /// Makes room for a motion of this length; what was known is kept when there is room already.
@@ -173,12 +181,13 @@ impl Warp {
         self.origin = self.margin.map(|m| -m);
         self.counts = std::array::from_fn(|c| ((lengths[c] / self.pitch[c]).ceil() as usize + 1).max(4));
         self.nodes = vec![f32x4::ZERO; self.counts.iter().product()];
-        self.warm = false;
+        self.before = self.nodes.clone();
+        self.known = 0;
     }
 
-    fn invert(&mut self, frames: &Frames, field: &(impl RowField + Sync), grid: &Grid, contraction: f32) -> WarpReport {
+    fn invert(&mut self, frames: &Frames, field: &Lazy<'_>, grid: &Grid, contraction: f32) -> WarpReport {
         let smallest_mm = grid.min_spacing() as f32;
-        let q = contraction.clamp(0.01, 0.95);
+        let q = contraction.clamp(0.01, LARGEST);
         let inverter = Inverter {
             scheme: Scheme::Newton,
             tolerance: 0.1 * self.options.tolerance_mm / smallest_mm,
@@ -187,39 +196,38 @@ impl Warp {
             max_iterations: 60,
         }
         .on_spacing(grid.spacing.map(|s| s as f32));
+        let lay = Lay { origin: self.origin, pitch: self.pitch, counts: self.counts };
         let [nx, ny, _] = self.counts;
-        let (origin, pitch) = (self.origin, self.pitch);
-        let world = |i: usize, j: usize, k: usize| {
-            [i as f32 * pitch[0] + origin[0], j as f32 * pitch[1] + origin[1], k as f32 * pitch[2] + origin[2]]
-        };
-        let (evaluations, unsettled) = self
-            .nodes
-            .par_chunks_mut(nx)
-            .enumerate()
-            .map(|(row, nodes)| {
-                let (j, k) = (row % ny, row / ny);
-                let (mut evaluations, mut unsettled) = (0u64, 0usize);
-                for (part, nodes) in nodes.chunks_mut(ROW).enumerate() {
-                    let n = nodes.len();
-                    let target: [f32x4; ROW] = std::array::from_fn(|m| frames.field_index(world(part * ROW + m.min(n - 1), j, k)));
-                    let mut position: [f32x4; ROW] = std::array::from_fn(|m| target[m] + frames.field_vector(nodes[m.min(n - 1)]));
-                    let mut converged = [false; ROW];
-                    evaluations += u64::from(inverter.invert_row(field, &target, 0..n, &mut position, &mut converged));
-                    for m in 0..n {
-                        if !converged[m] {
-                            let single = inverter.invert(&Single(field), three(target[m]), three(position[m]));
-                            evaluations += u64::from(single.iterations);
-                            position[m] = four(single.position);
-                            unsettled += usize::from(!single.converged);
-                        }
-                        nodes[m] = frames.volume_vector(position[m] - target[m]);
-                    }
-                }
-                (evaluations, unsettled)
-            })
-            .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
-        self.warm = true;
-        let (worst, sum) = self.residuals(frames, field);
+        let contracts = contraction < LARGEST;
+        let allowed = if contracts { inverter.stop() / q } else { inverter.stop() };
+        let [x, y, z] = inverter.weight.map(|w| allowed / w);
+        let lead = if self.known >= 2 { 1.0 } else { 0.0 };
+        let rows = self.nodes.par_chunks(nx).zip(self.before.par_chunks_mut(nx)).enumerate().map(|(row, (last, before))| {
+            let line = [row % ny, row / ny];
+            let task = Settle { field, frames, lay, line, last, before: &mut *before, lead, stop: [x, y, z, 1.0], contracts };
+            let found = quads::run(task);
+            let (mut evaluations, mut unsettled) = (found.evaluations, 0);
+            for i in found.open {
+                let node = [i, line[0], line[1]];
+                let target = frames.field_index(std::array::from_fn(|c| node[c] as f32 * lay.pitch[c] + lay.origin[c]));
+                let start = target + frames.field_vector(last[i]);
+                let single = inverter.invert(&Single(field), three(target), three(start));
+                evaluations += u64::from(single.iterations);
+                unsettled += usize::from(!single.converged);
+                before[i] = frames.volume_vector(four(single.position) - target);
+            }
+            (evaluations, unsettled)
+        });
+        let (evaluations, unsettled) = rows.reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+        // the new v has taken the place of the one before the last
+        std::mem::swap(&mut self.nodes, &mut self.before);
+        self.known = (self.known + 1).min(2);
+        let [_, ny, nz] = self.counts.map(|n| n - 1);
+        let rows = (0..ny * nz).into_par_iter().map(|row| {
+            let line = [row % ny, row / ny];
+            quads::run(Residual { field, frames, lay, line, nodes: &self.nodes })
+        });
+        let (worst, sum) = rows.reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1 + b.1));
         let bound = 1.0 / (1.0 - q);
         let cells = self.counts.iter().map(|n| n - 1).product::<usize>();
         WarpReport {
@@ -230,34 +238,6 @@ impl Warp {
             evaluations: evaluations + cells as u64,
             nodes: self.nodes.len(),
         }
-    }
-
-    /// Largest and summed residual [mm] at the middles of cells.
-    fn residuals(&self, frames: &Frames, field: &(impl RowField + Sync)) -> (f32, f64) {
-        let [nx, ny, nz] = self.counts;
-        (0..(ny - 1) * (nz - 1))
-            .into_par_iter()
-            .map(|row| {
-                let (j, k) = (row % (ny - 1), row / (ny - 1));
-                let (mut worst, mut sum) = (0.0f32, 0.0f64);
-                let middles: Vec<[f32; 3]> = (0..nx - 1)
-                    .map(|i| {
-                        let node = [i, j, k];
-                        std::array::from_fn(|c| (node[c] as f32 + 0.5) * self.pitch[c] + self.origin[c])
-                    })
-                    .collect();
-                let mut offsets = vec![f32x4::ZERO; middles.len()];
-                self.offsets(&middles, &mut offsets);
-                for (at, v) in middles.into_iter().zip(offsets) {
-                    let x = frames.field_index(at);
-                    let rest = x + frames.field_vector(v);
-                    let r = frames.length_mm(x - rest - field.value(rest));
-                    worst = worst.max(r);
-                    sum += f64::from(r);
-                }
-                (worst, sum)
-            })
-            .reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1 + b.1))
     }
 
     /// v [index] at a position of world space [index]: cubic (Lagrange) in the 4³ nodes around it, beyond the lattice as on its border.
@@ -373,7 +353,7 @@ impl<F: RowField> maille_displacement::DisplacementField for Single<'_, F> {
 }
 
 /// Volume index ↔ field index.
-struct Frames {
+pub(super) struct Frames {
     /// columns of the matrix, and what is added
     to_field: [f32x4; 4],
     to_volume: [f32x4; 3],
@@ -402,14 +382,29 @@ impl Frames {
         }
     }
 
+    /// Columns of the matrix that takes the volume's vectors to the field's.
+    pub fn vectors_to_field(&self) -> &[f32x4; 3] {
+        self.to_field.first_chunk().expect("the matrix before the shift")
+    }
+
+    /// And back.
+    pub fn vectors_to_volume(&self) -> &[f32x4; 3] {
+        &self.to_volume
+    }
+
+    /// Of the field's grid [mm].
+    pub fn field_spacing(&self) -> f32x4 {
+        self.field_spacing
+    }
+
     #[inline(always)]
-    fn field_index(&self, at: [f32; 3]) -> f32x4 {
+    pub fn field_index(&self, at: [f32; 3]) -> f32x4 {
         let [a, b, c, d] = self.to_field;
         a * f32x4::splat(at[0]) + b * f32x4::splat(at[1]) + c * f32x4::splat(at[2]) + d
     }
 
     #[inline(always)]
-    fn field_vector(&self, v: f32x4) -> f32x4 {
+    pub fn field_vector(&self, v: f32x4) -> f32x4 {
         let ([x, y, z], [a, b, c, _]) = (three(v), self.to_field);
         a * f32x4::splat(x) + b * f32x4::splat(y) + c * f32x4::splat(z)
     }
@@ -418,11 +413,5 @@ impl Frames {
     fn volume_vector(&self, v: f32x4) -> f32x4 {
         let ([x, y, z], [a, b, c]) = (three(v), self.to_volume);
         a * f32x4::splat(x) + b * f32x4::splat(y) + c * f32x4::splat(z)
-    }
-
-    #[inline(always)]
-    fn length_mm(&self, v: f32x4) -> f32 {
-        let [x, y, z] = three(v * self.field_spacing);
-        (x * x + y * y + z * z).sqrt()
     }
 }
