@@ -120,9 +120,9 @@ fn checked_inverse(u: &VectorField, path: &str, scratch: &Scratch, tolerance: f6
         let back = at(u, rest);
         let miss = length(std::array::from_fn(|c| rest[c] + back[c] - world[c]));
         // what it claims bounds the residual: that itself, here and there in f64 (then the rounding of patient coordinates is left), or in f32 with a
-        // bound on its rounding, which is a dozen units in the last place of the longest vector
+        // bound on its rounding, which is a dozen units in the last place of the longest vector and one of the largest index, in mm of the largest spacing
         let over = residuals[n] - miss;
-        assert!(miss <= tolerance * 1.000_001 && (-1e-9..=1e-4).contains(&over), "node {n}: {miss} mm, it claims {}", residuals[n]);
+        assert!(miss <= tolerance * 1.000_001 && (-1e-9..=2e-4).contains(&over), "node {n}: {miss} mm, it claims {}", residuals[n]);
         let inside = u.grid.index_from_world(rest);
         assert!((0..3).all(|c| inside[c] > -0.01 && inside[c] < (u.grid.size[c] - 1) as f64 + 0.01), "{inside:?}");
     }

@@ -219,7 +219,7 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
             }
             let points: Vec<FrontPoint> = fronts.of(knob.name)?;
             let ratio = time_at(&points, knob.defaults[0])? / time_at(&points, *value)?;
-            let part = if eased == l.process { l.stages.iter().find(|s| s.stage == stage)?.us / l.p50_us } else { 1.0 };
+            let part = if eased == l.process { l.stages.iter().find(|s| s.name == stage)?.us / l.p50_us } else { 1.0 };
             let saves = 1.0 - part.min(1.0) * (1.0 - ratio);
             (saves < WORTH).then(|| (saves, format!("`{}` = {} ({:.0} % of the time)", knob.name, knob.defaults[0], 100.0 * saves)))
         })
