@@ -14,6 +14,7 @@ use crate::{
 use maille_volume::{BrickSource, Sampler, VolumeInfo};
 use nalgebra::Vector3;
 use rayon::prelude::*;
+use wide::f32x4;
 
 /// Which way a section lies.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -132,6 +133,59 @@ impl Section {
     }
 }
 
+/// A row of a section's pixels: where they are at rest, and what was seen there, plane by plane of a slab.
+struct Row {
+    /// continuous index in the picture's space, of a warp
+    world: Vec<[f32; 3]>,
+    /// from there to the place at rest [index]
+    moved: Vec<f32x4>,
+    /// continuous index at rest
+    rest: Vec<[f64; 3]>,
+    /// sum, largest and number of values
+    seen: Vec<(f64, f64, u32)>,
+}
+
+impl Row {
+    fn new(width: usize) -> Self {
+        Self { world: vec![[0.0; 3]; width], moved: vec![f32x4::ZERO; width], rest: vec![[0.0; 3]; width], seen: Vec::with_capacity(width) }
+    }
+
+    fn begin(&mut self) {
+        let width = self.rest.len();
+        self.seen.clear();
+        self.seen.resize(width, (0.0, f64::NEG_INFINITY, 0));
+    }
+
+    /// Takes pixels to where they are at rest: as they lie, or all of them through the warp at once.
+    fn places(&mut self, index: impl Fn(f64) -> [f64; 3], warp: Option<&Warp>) {
+        for (x, rest) in self.rest.iter_mut().enumerate() {
+            *rest = index(x as f64);
+        }
+        let Some(warp) = warp else { return };
+        for (world, rest) in self.world.iter_mut().zip(&self.rest) {
+            *world = rest.map(|v| v as f32);
+        }
+        warp.offsets(&self.world, &mut self.moved);
+        for ((rest, world), moved) in self.rest.iter_mut().zip(&self.world).zip(&self.moved) {
+            let moved = moved.to_array();
+            *rest = std::array::from_fn(|c| f64::from(world[c] + moved[c]));
+        }
+    }
+
+    fn look(&mut self, sampler: &Sampler<'_, impl BrickSource + ?Sized>) {
+        for (seen, rest) in self.seen.iter_mut().zip(&self.rest) {
+            if let Some(hu) = sampler.value_at(*rest) {
+                *seen = (seen.0 + hu, seen.1.max(hu), seen.2 + 1);
+            }
+        }
+    }
+
+    fn value(&self, x: usize, mode: SlabMode) -> Option<f64> {
+        let (sum, most, count) = self.seen[x];
+        (count > 0).then(|| if mode == SlabMode::Mean { sum / f64::from(count) } else { most })
+    }
+}
+
 /// Draws a section on the current rayon pool; numbers that are not finite give black.
 pub fn section(source: &(impl BrickSource + ?Sized), section: &Section, picture: &mut Picture) {
     section_with(source, section, &Overlay::default(), picture);
@@ -148,44 +202,45 @@ pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, ove
     let labels = overlay.labels.filter(|l| l.size() == grid.size);
     let [right, down] = section.plane.axes().map(Vector3::from);
     let normal = right.cross(&down);
-    let planes = section.planes(grid.min_spacing());
-    let rest = |at: [f64; 3]| match warp {
-        Some(warp) => warp.rest_index(grid.index_from_world(at).map(|v| v as f32)).map(f64::from),
-        None => grid.index_from_world(at),
-    };
-    let value = |middle: Vector3<f64>| {
-        let (mut sum, mut most, mut count) = (0.0, f64::NEG_INFINITY, 0.0);
-        for n in 0..planes {
-            let t = if planes > 1 { n as f64 / (planes - 1) as f64 - 0.5 } else { 0.0 };
-            let at = (middle + normal * (t * section.slab_mm)).into();
-            // straight there when nothing moves
-            let at = if warp.is_some() { grid.world_from_index(rest(at)) } else { at };
-            if let Some(hu) = sampler.value(at) {
-                (sum, most, count) = (sum + hu, f64::max(most, hu), count + 1.0);
-            }
-        }
-        (count > 0.0).then_some(if section.slab_mode == SlabMode::Mean { sum / count } else { most })
-    };
+    let (planes, to_world) = (section.planes(grid.min_spacing()), grid.world_from_index_matrix());
     let gain = 255.0 / section.window.max(1e-9);
-    picture.rgb.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
-        for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
-            let at = section.position(x as f64, y as f64, width, height);
-            let Some(hu) = value(at.into()) else {
-                pixel.fill(0);
-                continue;
-            };
-            pixel.fill(((hu - section.level) * gain + 128.0).clamp(0.0, 255.0) as u8);
-            if let Some(labels) = labels {
-                let [r, g, b, share] = labels.colors[usize::from(labels.at(rest(at)))];
-                tint([r, g, b], 0.5 * share, pixel);
+    picture.rgb.par_chunks_mut(3 * width).enumerate().for_each_init(
+        || Row::new(width),
+        |line, (y, row)| {
+            line.begin();
+            for n in 0..planes {
+                let t = if planes > 1 { n as f64 / (planes - 1) as f64 - 0.5 } else { 0.0 };
+                line.places(
+                    |x| {
+                        sampler.index((Vector3::from(section.position(x, y as f64, width, height)) + normal * (t * section.slab_mm)).into())
+                    },
+                    warp,
+                );
+                line.look(&sampler);
             }
-            if let (Some(_), Some(opaque_mm)) = (warp, overlay.displacement_mm) {
-                let u = Vector3::from(at) - Vector3::from(grid.world_from_index(rest(at)));
-                let (color, share) = color(u.dot(&right), -u.dot(&down), opaque_mm);
-                tint(color, share, pixel);
+            if planes > 1 && (labels.is_some() || overlay.displacement_mm.is_some()) {
+                line.places(|x| sampler.index(section.position(x, y as f64, width, height)), warp);
             }
-        }
-    });
+            for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
+                let Some(hu) = line.value(x, section.slab_mode) else {
+                    pixel.fill(0);
+                    continue;
+                };
+                pixel.fill(((hu - section.level) * gain + 128.0).clamp(0.0, 255.0) as u8);
+                if let Some(labels) = labels {
+                    let [r, g, b, share] = labels.colors[usize::from(labels.at(line.rest[x]))];
+                    tint([r, g, b], 0.5 * share, pixel);
+                }
+                if let (Some(_), Some(opaque_mm)) = (warp, overlay.displacement_mm) {
+                    // from where it lies at rest
+                    let [i, j, k, _] = line.moved[x].to_array().map(f64::from);
+                    let u = -(to_world * Vector3::new(i, j, k));
+                    let (color, share) = color(u.dot(&right), -u.dot(&down), opaque_mm);
+                    tint(color, share, pixel);
+                }
+            }
+        },
+    );
     if let Some(geometry) = overlay.geometry.filter(|g| !g.is_empty() && g.check().is_ok()) {
         crate::outline::outlines(geometry, section, picture);
     }

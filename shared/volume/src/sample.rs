@@ -45,7 +45,13 @@ impl<'a, S: BrickSource + ?Sized> Sampler<'a, S> {
     /// Value (HU) at a patient position [mm]; `None` outside the box of voxel centres, and for NaN.
     #[inline]
     pub fn value(&self, world: [f64; 3]) -> Option<f64> {
-        let (brick, at, f) = self.locate(self.index(world))?;
+        self.value_at(self.index(world))
+    }
+
+    /// Value (HU) at a continuous index; `None` outside the box of voxel centres, and for NaN.
+    #[inline]
+    pub fn value_at(&self, index: [f64; 3]) -> Option<f64> {
+        let (brick, at, f) = self.locate(index)?;
         let v = &brick.voxels;
         let line = |o: usize| lerp(f64::from(v[o]), f64::from(v[o + 1]), f[0]);
         let plane = |o: usize| lerp(line(o), line(o + ROW), f[1]);

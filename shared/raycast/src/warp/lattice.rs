@@ -247,7 +247,7 @@ impl Warp {
     }
 
     /// [`Self::offset_four`] at many positions.
-    pub(super) fn offsets(&self, at: &[[f32; 3]], out: &mut [f32x4]) {
+    pub(crate) fn offsets(&self, at: &[[f32; 3]], out: &mut [f32x4]) {
         quads::run(Offsets { warp: self, at, out });
     }
 
