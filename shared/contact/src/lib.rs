@@ -30,6 +30,7 @@ mod node;
 pub mod passivity;
 pub mod proxy;
 mod rest;
+mod restore;
 pub mod shape;
 pub mod shaper;
 pub mod surface;

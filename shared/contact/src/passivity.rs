@@ -19,7 +19,9 @@
 //! made good by Hannaford and Ryu's damper, −α v with α rising to α_max as the balance falls.
 //! Without Coulomb friction of K·Δ/2 in the device a light hand that rests on a stiff wall keeps a limit cycle alive [Abbott & Okamura 2005]; the
 //! controller then lets the wall give way rather than feed it, unless the device's own damping is known: then a tip at rest is allowed what that
-//! damping takes, and a chatter of an encoder step (`rest`).
+//! damping takes, and a chatter of an encoder step (`rest`). Where taps, a fast landing or a fade have left the balance overdrawn under a tip that now
+//! rests, the force comes back by a slow rise whose work is granted within a purse (`restore`): the two are what a resting hand may get beyond
+//! the millijoule that holds for taps.
 //!
 //! **Reference.** What counts as stored is at most the elastic energy that the contact reports plus a reserve, so an hour of dissipation
 //! does not license minutes of buzzing [a bounded reference for the energy: Ryu et al. 2005]. Work done by tissue that moves by itself is granted
@@ -31,6 +33,7 @@
 use crate::{
     V3,
     rest::{Balance, Rest},
+    restore::{Restore, Standing},
     velocity::Velocity,
 };
 
@@ -99,6 +102,7 @@ pub struct Passivity {
     /// sum of their variances [mJ²]
     doubt_squared: f64,
     rest: Rest,
+    restore: Restore,
     /// ticks since the force was lowered
     since_lowered: usize,
 }
@@ -138,6 +142,7 @@ impl Passivity {
             doubt_mj: 0.0,
             doubt_squared: 0.0,
             rest: Rest::new(),
+            restore: Restore::new(),
             since_lowered: usize::MAX,
         }
     }
@@ -207,6 +212,7 @@ impl Passivity {
             let balance = Balance { certain_mj, elastic_mj, damping_n_s_per_mm, quantum_mm, speed_mm_s };
             self.energy_mj += self.rest.allowed(&balance, dt_s);
         }
+        let (wanted, ceiling) = self.restored(wanted, dt_s);
         // what is beyond the reference is forgotten
         let surplus = self.certain_mj() - (elastic_mj + self.reserve_mj);
         if surplus > 0.0 {
@@ -239,12 +245,34 @@ impl Passivity {
         }
         let out = (force.dot(&velocity) + force.norm() * slack) * dt_s;
         let quickening = 0.5 * per_mass * force.norm_squared() * dt_s * dt_s;
-        let share = largest_share(quickening, out, stored.max(0.0));
+        let share = ceiling * largest_share(quickening, out, stored.max(0.0));
         // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
         self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + dt_s / SHARE_S } else { 1.0 });
         self.lowered += u64::from(self.share < 1.0);
         self.since_lowered = if self.share < 1.0 { 0 } else { self.since_lowered.saturating_add(1) };
-        force * self.share
+        if ceiling > 0.0 { force * (self.share / ceiling) } else { V3::zeros() }
+    }
+
+    /// What of the force there may be while it is on its way back (`restore`), and as a share.
+    fn restored(&mut self, wanted: V3, dt_s: f64) -> (V3, f64) {
+        let speed_mm_s = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2).smooth.norm();
+        let given_n = self.force_ago(0).norm();
+        // as the controller foresees it: nothing but the mass holds against the force
+        let unseen_n_s = given_n * self.port.delay_ticks as f64 * dt_s;
+        let standing = Standing {
+            still: self.rest.is_still() && self.port.damping_n_s_per_mm > 0.0,
+            certain_mj: self.certain_mj(),
+            pending_mj: 500.0 / self.port.mass_kg * unseen_n_s * unseen_n_s,
+            share: self.share,
+            given_n,
+            wanted_n: wanted.norm(),
+            speed_mm_s,
+        };
+        self.energy_mj += self.restore.granted(&standing, dt_s);
+        match self.restore.ceiling_n() {
+            Some(ceiling) if ceiling < standing.wanted_n => (wanted * (ceiling / standing.wanted_n), ceiling / standing.wanted_n),
+            _ => (wanted, 1.0),
+        }
     }
 
     /// Takes the work of the interval that the new position ends into the balance.

@@ -10,7 +10,7 @@
 //! - while they lie within [`CHATTER_STEPS`] steps: what the balance lost, beyond the elastic energy, since that began, at most b (ω Δ)².
 //!
 //! Faster motion, and a buzz that grows beyond a step, are charged as ever: in taps nothing is allowed. A balance that is overdrawn is given at most
-//! [`RETURN_MJ_S`]: a force that was lowered comes back slowly. Nothing is allowed on a device whose damping is not known.
+//! [`RETURN_MJ_S`]: a force that was lowered comes back by `restore`. Nothing is allowed on a device whose damping is not known.
 //!
 //! Units: mm, s, mJ = N·mm, N·s/mm. Cost: constant. Allocation: none. Not here: the balance (`passivity`).
 
