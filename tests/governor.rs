@@ -201,7 +201,7 @@ fn under_load_knobs_give_way_in_order_and_come_back_and_the_hand_feels_no_step()
     }
     // the slew limit would hold 0.1 N whatever happened: no step is no more than the hand's own, give or take a late tick
     let own_n = plain.largest_step_n;
-    assert!(seen.largest_step_n <= (1.5 * own_n).max(0.05).min(STEP_N), "{} N in one tick, {own_n} without load", seen.largest_step_n);
+    assert!(seen.largest_step_n <= (1.5 * own_n).clamp(0.05, STEP_N), "{} N in one tick, {own_n} without load", seen.largest_step_n);
     // turn by turn, a place on the ladder of rendering: one rung down, or back up by that one
     let mut place = 0;
     for t in turns.iter().filter(|t| t["of"] == "rendering") {

@@ -111,7 +111,7 @@ fn names_that_are_none_are_wrong_use_and_told_with_those_that_are() {
     let said = String::from_utf8_lossy(&out.stderr);
     assert!(said.contains("no.such") && said.contains("rendering.step"), "{said}");
     let out = maille(&["effects", "--only", "no-such"]);
-    assert_eq!(out.status.code(), Some(1));
+    assert_eq!(out.status.code(), Some(2));
     let said = String::from_utf8_lossy(&out.stderr);
     assert!(said.contains("no-such") && said.contains("sections"), "{said}");
     assert_eq!(maille(&["effects", "--duration", "1s"]).status.code(), Some(2));

@@ -237,7 +237,8 @@ fn word(of: Loop) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use maille_contract::{ControlBlock, control::Counter};
+    use maille_contract::{ControlBlock, ServiceState, control::Counter};
+    use std::sync::atomic::Ordering::Relaxed;
 
     const LOOK: u64 = LOOK_NS;
 
@@ -344,10 +345,21 @@ mod tests {
         let (mut pilot, control, mut now) = started();
         run(&mut pilot, &control, &mut now, 1.0, frame(500.0), 0);
         assert!(!pilot.report().turns.is_empty());
-        for _ in 0..100 {
-            now += LOOK;
-            pilot.look(&control, now);
-        }
+        let given = pilot.report().given_up;
+        let mut look = |pilot: &mut Pilot, beats: bool| {
+            for _ in 0..100 {
+                now += LOOK;
+                if beats {
+                    control.service(Role::Rendering).heartbeat_ns.store(now, Relaxed);
+                }
+                pilot.look(&control, now);
+            }
+        };
+        // one of which nothing is heard is starved or dead, and does not rest
+        look(&mut pilot, false);
+        assert!(pilot.report().given_up.len() >= given.len());
+        control.service(Role::Rendering).set_state(ServiceState::Ready);
+        look(&mut pilot, true);
         let turns = pilot.report().turns;
         assert!(turns.iter().filter(|t| t.coarser).count() <= 5 && pilot.report().given_up.is_empty(), "{turns:?}");
     }
