@@ -188,14 +188,10 @@ fn steps<W: Stopwatch>(
         waiting.retain_mut(|message| message.checked().map(|checked| *message = checked).is_some());
         life.cell().count(Counter::Refused, (told - waiting.len()) as u64);
         waiting.retain(|message| !engine.has_answered(message));
-        let Some(newest) = waiting.last().copied() else { continue };
+        let Some(sequence) = waiting.last().map(|newest| newest.stamp.sequence) else { continue };
         pace.stepped(now);
-        let done = match engine.incises() {
-            true => engine.incise(&waiting, now, reader, &mut writer),
-            false => engine.step(&newest, now, reader, &mut writer),
-        };
-        if let Some(done) = done {
-            announcer.step(&mut life, &done, now, Some(newest.stamp.sequence));
+        if let Some(done) = engine.step(&waiting, now, reader, &mut writer) {
+            announcer.step(&mut life, &done, now, Some(sequence));
         }
     }
 }

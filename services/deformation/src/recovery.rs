@@ -156,7 +156,7 @@ impl Process {
     fn work(&mut self, work: Work, now_ns: u64) -> Option<Done> {
         match work {
             Work::Push(message) => self.engine.press(&message, now_ns, &self.reader, &mut self.writer),
-            Work::Incise(message) => self.engine.step(&message, now_ns, &self.reader, &mut self.writer),
+            Work::Incise(message) => self.engine.step(&[message], now_ns, &self.reader, &mut self.writer),
             Work::Undo(undos) => self.engine.undo(undos, &self.reader, &mut self.writer),
             Work::Relax => self.engine.relax(now_ns, 66_000_000, &[], &|| false, &self.reader, &mut self.writer),
             Work::Settle => {

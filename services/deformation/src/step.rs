@@ -255,8 +255,7 @@ impl<W: Stopwatch> Engine<W> {
     }
 
     /// Answers tool moves at `now_ns`, the oldest first, by taking away what lay below the tip at each; `None` when nothing did.
-    pub fn incise(&mut self, messages: &[ToolMove], now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
-        self.watch.start();
+    fn incise(&mut self, messages: &[ToolMove], now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         let (incisions, rest, threshold_hu) = (self.incisions.as_mut()?, reader.rest(), self.state.threshold_hu);
         let mut all: Option<Changed> = None;
         for message in messages {
@@ -285,14 +284,11 @@ impl<W: Stopwatch> Engine<W> {
         Done { moved_elements: changed.elements, ..self.commit_with(&changed.region, &changed.numbered, reader, writer) }
     }
 
-    /// Answers a tool move at `now_ns`, as the scene has it; `None` when there is nothing to do.
-    pub fn step(&mut self, message: &ToolMove, now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+    /// Answers the tool moves that wait, the oldest first, at `now_ns`, as the scene has it; `None` when there is nothing to do.
+    pub fn step(&mut self, messages: &[ToolMove], now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         self.watch.start();
-        if self.incises() {
-            self.incise(std::slice::from_ref(message), now_ns, reader, writer)
-        } else {
-            self.press(message, now_ns, reader, writer)
-        }
+        // a push is superseded by the newest
+        if self.incises() { self.incise(messages, now_ns, reader, writer) } else { self.press(messages.last()?, now_ns, reader, writer) }
     }
 
     /// Answers a tool move by pushing; `None` when there is nothing to push.

@@ -27,7 +27,9 @@ impl Turns {
 
     /// Answers a tool move; elements that it moved.
     pub fn step(&mut self, message: &ToolMove) -> u64 {
-        self.engine.step(message, monotonic_ns(), &self.reader, &mut self.writer).map_or(0, |done| done.moved_elements)
+        self.engine
+            .step(std::slice::from_ref(message), monotonic_ns(), &self.reader, &mut self.writer)
+            .map_or(0, |done| done.moved_elements)
     }
 
     /// Switches what may be switched.

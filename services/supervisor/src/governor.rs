@@ -122,7 +122,7 @@ pub fn ladder(scene: &Scene, fronts: &Fronts) -> Ladder {
         if between.iter().all(|p| p.value != own) {
             between.push(FrontPoint { value: own, time: start.1, error: start.0 });
         }
-        let part = if name.starts_with("breathing") { Part::Warp } else { Part::View };
+        let part = if knob.stage.is_some_and(|(_, stage)| stage == "warp") { Part::Warp } else { Part::View };
         ladder = ladder.then(name, of, part, own, f64::INFINITY, &between);
     }
     ladder

@@ -34,7 +34,7 @@ use crate::{
     V3,
     rest::{Balance, Rest},
     restore::{Restore, Standing},
-    velocity::Velocity,
+    velocity::{Estimate, Velocity},
 };
 
 /// Most ticks a pose can be late.
@@ -203,26 +203,27 @@ impl Passivity {
     /// The force to give in place of `wanted`, with the device seen at `position` after `dt_s`, when the contact's springs hold
     /// `elastic_mj`.
     pub(crate) fn control(&mut self, position: V3, wanted: V3, elastic_mj: f64, dt_s: f64) -> V3 {
-        self.observe(position, dt_s);
+        let per_mass = 1000.0 / self.port.mass_kg;
+        let delay = self.port.delay_ticks;
+        let last = self.force_ago(delay);
+        self.velocity.push(position);
+        let estimate = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2 + per_mass * last.norm());
+        let speed_mm_s = estimate.smooth.norm();
+        self.observe(position, &estimate, dt_s);
         self.rest.push(position);
         if self.rest.is_still() {
             let port = &self.port;
-            let speed_mm_s = self.velocity.estimate(port.quantum_mm, dt_s, port.hand_mm_s2).smooth.norm();
             let (damping_n_s_per_mm, quantum_mm, certain_mj) = (port.damping_n_s_per_mm, port.quantum_mm, self.certain_mj());
             let balance = Balance { certain_mj, elastic_mj, damping_n_s_per_mm, quantum_mm, speed_mm_s };
             self.energy_mj += self.rest.allowed(&balance, dt_s);
         }
-        let (wanted, ceiling) = self.restored(wanted, dt_s);
+        let (wanted, ceiling) = self.restored(wanted, speed_mm_s, dt_s);
         // what is beyond the reference is forgotten
         let surplus = self.certain_mj() - (elastic_mj + self.reserve_mj);
         if surplus > 0.0 {
             self.energy_mj -= surplus;
             self.credit_mj = (self.credit_mj - surplus).max(0.0);
         }
-        let per_mass = 1000.0 / self.port.mass_kg;
-        let delay = self.port.delay_ticks;
-        let last = self.force_ago(delay);
-        let estimate = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2 + per_mass * last.norm());
         // what the pending forces may have given out since the position that is seen
         let mut stored = self.certain_mj() + ADVANCE_MJ - 0.5 * self.port.quantum_mm * one_norm(&last);
         let (mut velocity, mut slack) = (estimate.velocity, SLACK * estimate.error);
@@ -237,10 +238,9 @@ impl Passivity {
         let mut force = wanted;
         let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
         if deficit > 0.0 && wanted.norm_squared() > 0.0 {
-            let speed = estimate.smooth.norm();
             // at most as large as the force itself: touching is no step, and tissue never pulls
-            let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed > 0.0 { wanted.norm() / speed } else { 0.0 });
-            self.dissipated_mj += alpha * speed * speed * dt_s;
+            let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed_mm_s > 0.0 { wanted.norm() / speed_mm_s } else { 0.0 });
+            self.dissipated_mj += alpha * speed_mm_s * speed_mm_s * dt_s;
             force -= estimate.smooth * alpha;
         }
         let out = (force.dot(&velocity) + force.norm() * slack) * dt_s;
@@ -254,8 +254,7 @@ impl Passivity {
     }
 
     /// What of the force there may be while it is on its way back (`restore`), and as a share.
-    fn restored(&mut self, wanted: V3, dt_s: f64) -> (V3, f64) {
-        let speed_mm_s = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2).smooth.norm();
+    fn restored(&mut self, wanted: V3, speed_mm_s: f64, dt_s: f64) -> (V3, f64) {
         let given_n = self.force_ago(0).norm();
         // as the controller foresees it: nothing but the mass holds against the force
         let unseen_n_s = given_n * self.port.delay_ticks as f64 * dt_s;
@@ -276,21 +275,17 @@ impl Passivity {
     }
 
     /// Takes the work of the interval that the new position ends into the balance.
-    fn observe(&mut self, position: V3, dt_s: f64) {
+    fn observe(&mut self, position: V3, estimate: &Estimate, dt_s: f64) {
         let Some(last) = self.last_position.replace(position) else {
             self.rounding = [(0.0, 0.5 * self.port.quantum_mm); 3];
-            self.velocity.push(position);
             return;
         };
-        self.velocity.push(position);
         let moved = position - last;
         let force = self.force_ago(self.port.delay_ticks);
         let change = force - self.force_ago(self.port.delay_ticks + 1);
         self.energy_mj -= force.dot(&moved);
         let quantum = self.port.quantum_mm;
         if quantum > 0.0 {
-            let largest = self.port.hand_mm_s2 + 1000.0 / self.port.mass_kg * force.norm();
-            let estimate = self.velocity.estimate(quantum, dt_s, largest);
             // a lowered force changes abruptly, and the tip with it: then, and in motion, only the shortest windows follow
             let quick = !self.rest.is_still() || self.since_lowered < LOWERED_TICKS;
             let way = if quick { estimate.velocity } else { estimate.smooth } * dt_s;

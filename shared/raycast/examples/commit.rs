@@ -6,26 +6,15 @@
 //! Frames with and without a commit before them in turns, of two voxel contents in turns, so that both kinds draw the same two pictures; processor time of two
 //! threads, halved (the medians of many, and the median of the neighbours' differences). What writes the bricks is another process's work, and not counted.
 
+mod clock;
+
+use clock::{median, now};
 use maille_raycast::{Camera, Picture, Preset, Settings, Skip, Step, render};
 use maille_volume::{Brick, BrickSource as _, BrickedVolume, io::read_volume};
 use std::path::Path;
 
 const SIZE: [usize; 2] = [1224, 1014];
 const ROUNDS: usize = 20;
-
-/// Processor time of all threads, over two [ms].
-fn now() -> f64 {
-    let of = |task: std::io::Result<std::fs::DirEntry>| -> Option<f64> {
-        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        text.split_whitespace().next()?.parse().ok()
-    };
-    std::fs::read_dir("/proc/self/task").expect("Linux").filter_map(of).sum::<f64>() * 0.5e-6
-}
-
-fn median(mut of: Vec<f64>) -> f64 {
-    of.sort_by(f64::total_cmp);
-    of[of.len() / 2]
-}
 
 fn main() {
     let file = std::env::args().nth(1).expect("a volume");

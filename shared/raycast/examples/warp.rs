@@ -8,6 +8,9 @@
 //! breath as so many key frames instead, between which coefficients go in straight lines (0: the three fields themselves).
 //! Times are processor time over two threads, the median of frames taken in turns: a loaded machine disturbs ratios less than times.
 
+mod clock;
+
+use clock::{median, now};
 use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Step, Warp, WarpOptions, render, render_extra, resampled};
 use maille_volume::{BrickSource as _, BrickedVolume, Grid, VectorField, io::read_volume};
 use rayon::prelude::*;
@@ -17,20 +20,6 @@ const SIZE: [usize; 2] = [1224, 1014];
 const ROUNDS: usize = 7;
 /// Updates, and lattices of a picture, timed together; with ROUNDS 7 more than a multiple of 14.
 const BATCH: usize = 11;
-
-/// Processor time of all threads, over two [ms].
-fn now() -> f64 {
-    let of = |task: std::io::Result<std::fs::DirEntry>| -> Option<f64> {
-        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        text.split_whitespace().next()?.parse().ok()
-    };
-    std::fs::read_dir("/proc/self/task").expect("Linux").filter_map(of).sum::<f64>() * 0.5e-6
-}
-
-fn median(mut of: Vec<f64>) -> f64 {
-    of.sort_by(f64::total_cmp);
-    of[of.len() / 2]
-}
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
