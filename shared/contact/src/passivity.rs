@@ -34,7 +34,7 @@ use crate::{
     V3,
     rest::{Balance, Rest},
     restore::{Restore, Standing},
-    velocity::{Estimate, Velocity},
+    velocity::{Estimate, Velocity, WINDOW},
 };
 
 /// Most ticks a pose can be late.
@@ -67,12 +67,14 @@ pub struct Port {
     pub hand_mm_s2: f64,
     /// the device's own damping [N·s/mm]; 0 where nothing is known of it: then a hand at rest is allowed nothing
     pub damping_n_s_per_mm: f64,
+    /// time from tick to tick, as planned [s]: how long a force is held, however late the last tick was
+    pub period_s: f64,
 }
 
 impl Default for Port {
     /// Poses at once and exact; a light desktop device.
     fn default() -> Self {
-        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0, damping_n_s_per_mm: 0.0 }
+        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0, damping_n_s_per_mm: 0.0, period_s: 1e-3 }
     }
 }
 
@@ -123,6 +125,7 @@ impl Passivity {
             mass_kg: hold(port.mass_kg, 0.01, 10.0, 0.05),
             hand_mm_s2: hold(port.hand_mm_s2, 0.0, 1e6, 1e4),
             damping_n_s_per_mm: hold(port.damping_n_s_per_mm, 0.0, 1.0, 0.0),
+            period_s: hold(port.period_s, 1e-5, 0.1, 1e-3),
         };
         Self {
             port,
@@ -206,8 +209,10 @@ impl Passivity {
         let per_mass = 1000.0 / self.port.mass_kg;
         let delay = self.port.delay_ticks;
         let last = self.force_ago(delay);
-        self.velocity.push(position);
-        let estimate = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2 + per_mass * last.norm());
+        // what lies ahead is a tick as planned: a late one is no reason to fear that the next will be as late, and to let go for that
+        let ahead_s = self.port.period_s;
+        self.follow(position, dt_s);
+        let estimate = self.velocity.estimate(self.port.quantum_mm, ahead_s, self.port.hand_mm_s2 + per_mass * last.norm());
         let speed_mm_s = estimate.smooth.norm();
         self.observe(position, &estimate, dt_s);
         self.rest.push(position);
@@ -229,12 +234,12 @@ impl Passivity {
         let (mut velocity, mut slack) = (estimate.velocity, SLACK * estimate.error);
         for ago in (0..delay).rev() {
             let force = self.force_ago(ago);
-            let quickened = force * (per_mass * dt_s);
-            slack += SLACK * self.port.hand_mm_s2 * dt_s;
-            stored -= (force.dot(&(velocity + quickened * 0.5)) + force.norm() * slack) * dt_s;
+            let quickened = force * (per_mass * ahead_s);
+            slack += SLACK * self.port.hand_mm_s2 * ahead_s;
+            stored -= (force.dot(&(velocity + quickened * 0.5)) + force.norm() * slack) * ahead_s;
             velocity += quickened;
         }
-        slack += SLACK * self.port.hand_mm_s2 * dt_s;
+        slack += SLACK * self.port.hand_mm_s2 * ahead_s;
         let mut force = wanted;
         let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
         if deficit > 0.0 && wanted.norm_squared() > 0.0 {
@@ -243,21 +248,31 @@ impl Passivity {
             self.dissipated_mj += alpha * speed_mm_s * speed_mm_s * dt_s;
             force -= estimate.smooth * alpha;
         }
-        let out = (force.dot(&velocity) + force.norm() * slack) * dt_s;
-        let quickening = 0.5 * per_mass * force.norm_squared() * dt_s * dt_s;
+        let out = (force.dot(&velocity) + force.norm() * slack) * ahead_s;
+        let quickening = 0.5 * per_mass * force.norm_squared() * ahead_s * ahead_s;
         let share = ceiling * largest_share(quickening, out, stored.max(0.0));
         // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
-        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + dt_s / SHARE_S } else { 1.0 });
+        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + ahead_s / SHARE_S } else { 1.0 });
         self.lowered += u64::from(self.share < 1.0);
         self.since_lowered = if self.share < 1.0 { 0 } else { self.since_lowered.saturating_add(1) };
         if ceiling > 0.0 { force * (self.share / ceiling) } else { V3::zeros() }
+    }
+
+    /// Takes the position into the estimate of the velocity, whose windows are of ticks as planned: the ticks missed before a late one are
+    /// filled by a straight line.
+    fn follow(&mut self, position: V3, dt_s: f64) {
+        let ticks = (dt_s / self.port.period_s).round().clamp(1.0, WINDOW as f64) as usize;
+        let from = self.last_position.unwrap_or(position);
+        for n in 1..=ticks {
+            self.velocity.push(from + (position - from) * (n as f64 / ticks as f64));
+        }
     }
 
     /// What of the force there may be while it is on its way back (`restore`), and as a share.
     fn restored(&mut self, wanted: V3, speed_mm_s: f64, dt_s: f64) -> (V3, f64) {
         let given_n = self.force_ago(0).norm();
         // as the controller foresees it: nothing but the mass holds against the force
-        let unseen_n_s = given_n * self.port.delay_ticks as f64 * dt_s;
+        let unseen_n_s = given_n * self.port.delay_ticks as f64 * self.port.period_s;
         let standing = Standing {
             still: self.rest.is_still() && self.port.damping_n_s_per_mm > 0.0,
             certain_mj: self.certain_mj(),

@@ -254,6 +254,7 @@ impl HapticCore {
             quantum_mm: config.pose_quantum_mm,
             mass_kg: config.device_mass_kg,
             damping_n_s_per_mm: config.device_damping_n_s_per_mm,
+            period_s: config.period_s,
             ..Port::default()
         };
         let mut nodes = [Node::new(&config.shape.nodes()[0]); MAX_NODES];
