@@ -213,8 +213,6 @@ pub struct TickOutputs {
 pub struct HapticCore {
     config: HapticConfig,
     nodes: [Node; MAX_NODES],
-    /// largest slope of a law of share 1 [N/mm], so that all nodes together stay within the coupling
-    slope: f64,
     passivity: Passivity,
     shaper: ForceShaper,
     torque_shaper: ForceShaper,
@@ -264,7 +262,6 @@ impl HapticCore {
         let torque = Limits { max_force_n: config.max_torque_n_mm, max_slew_n_per_s: config.max_torque_slew_n_mm_per_s, ..config.limits };
         Self {
             nodes,
-            slope: config.coupling.stiffness_n_per_mm() / config.shape.total_share(),
             passivity: Passivity::on_port(RESERVE_MJ, config.passivity_damping_n_s_per_mm, port),
             shaper: ForceShaper::new(config.limits),
             torque_shaper: ForceShaper::new(torque),
@@ -489,7 +486,6 @@ impl HapticCore {
             committed,
             other_surface,
             threshold,
-            stiffness_n_per_mm: self.slope,
             damping_n_s_per_mm: self.config.coupling.damping_n_s_per_mm() / self.config.shape.total_share(),
         };
         let rotation = self.world_from_tool.unwrap_or_else(UnitQuaternion::identity);
@@ -499,6 +495,9 @@ impl HapticCore {
         let (mut force, mut torque, mut buried) = (V3::zeros(), V3::zeros(), 0);
         let mut deepest: Option<(usize, V3, Contact)> = None;
         self.elastic_mj = 0.0;
+        let stiffness = self.config.coupling.stiffness_n_per_mm();
+        let called: f64 = self.nodes[..count].iter().map(|node| node.called_for(stiffness)).sum();
+        let weights: f64 = self.nodes.iter().zip(shape.nodes()).map(|(node, of)| of.share * node.weight()).sum();
         for (n, (node, of)) in self.nodes.iter_mut().zip(shape.nodes()).enumerate() {
             let mut arm = rotation * V3::from(of.offset_mm);
             if let Some(moving) = moving.as_deref_mut().filter(|_| of.offset_mm != [0.0; 3]) {
@@ -506,7 +505,8 @@ impl HapticCore {
             }
             let velocity = self.velocity + self.spin.cross(&arm);
             let search = (n + count - self.ticks * MAX_SEARCHES % count) % count < MAX_SEARCHES;
-            let felt = node.touch(tissue, x + arm, velocity, search, &now);
+            let slope = node.slope(called, weights, stiffness);
+            let felt = node.touch(tissue, (x + arm, velocity), search, slope, &now);
             force += felt.force;
             torque += (felt.at - handle).cross(&felt.force);
             buried += usize::from(felt.buried);
