@@ -50,3 +50,21 @@ fn table(rows: &[Tissue]) -> TissueTable {
     let ends = |t: &Tissue| [(t.hu[0], material(t)), (t.hu[1] - 0.1 * (t.hu[1] - t.hu[0]), material(t))];
     TissueTable::new(&solid.flat_map(ends).collect::<Vec<_>>())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The scene's bounds are those of touch: no row of a table and no part of a shaft is lost on the way.
+    #[test]
+    fn a_scene_says_no_more_than_touch_can_feel() {
+        assert_eq!(maille_scene::LONGEST_SHAFT, maille_contact::LONGEST_SHAFT);
+        let one = Scene::default().tissues.remove(0);
+        let row = |n: usize| Tissue { hu: [n as f64 * 10.0, n as f64 * 10.0 + 10.0], stiffness_n_per_mm: 0.01 + n as f64, ..one.clone() };
+        let rows: Vec<Tissue> = (0..maille_scene::MOST_TISSUES).map(row).collect();
+        let table = table(&rows);
+        for row in &rows {
+            assert_eq!(table.at(row.hu[0] + 1.0).stiffness_n_per_mm, row.stiffness_n_per_mm);
+        }
+    }
+}

@@ -27,6 +27,8 @@ use crate::{
 };
 use nalgebra::{Quaternion, UnitQuaternion};
 
+/// Time constant of the mean age of poses [s]: one late exchange is no slow device.
+const POSE_AGE_S: f64 = 0.2;
 /// Time constant of the velocity estimate [s].
 const VELOCITY_S: f64 = 0.005;
 /// No hand is faster [mm/s]: what a device says of its velocity beyond this is not taken, and positions alone count.
@@ -226,6 +228,8 @@ pub struct HapticCore {
     orientation: Option<UnitQuaternion<f64>>,
     /// [rad/s]
     spin: V3,
+    /// mean age of the poses [s]
+    pose_age_s: f64,
     epoch: Option<u64>,
     threshold: f64,
     /// force before limits at the last tick [N]
@@ -273,6 +277,7 @@ impl HapticCore {
             world_from_tool: None,
             orientation: None,
             spin: V3::zeros(),
+            pose_age_s: 0.0,
             epoch: None,
             threshold: f64::NAN,
             last_wanted: V3::zeros(),
@@ -325,6 +330,9 @@ impl HapticCore {
     ) -> TickOutputs {
         let dt = self.step_time(inputs.now_ns);
         let mut fading = inputs.release;
+        if self.config.passivity {
+            self.passivity.seen(if inputs.pose_age_s.is_finite() { inputs.pose_age_s.max(0.0) } else { MAX_STEP_S }, dt);
+        }
         let (x, jumped) = self.accept_pose(&inputs.pose, inputs.pose_age_s, dt, &mut fading);
         let tissue_late = inputs.tissue_age_s.is_nan() || inputs.tissue_age_s > self.config.max_tissue_age_s;
         if inputs.tissue.is_none() || tissue_late {
@@ -367,12 +375,12 @@ impl HapticCore {
             if let Some(moving) = &moving {
                 self.passivity.grant(given.dot(&V3::from(moving.moved_mm())));
             }
-            let force = self.passivity.control(port, V3::from(out.force_n), self.elastic_mj, dt);
+            let force = self.passivity.control(port, V3::from(out.force_n), V3::from(out.torque_n_mm), self.elastic_mj, dt);
             self.shaper.cut_to(force);
             self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
             (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
         }
-        self.passivity.given(V3::from(out.force_n));
+        self.passivity.given(V3::from(out.force_n), V3::from(out.torque_n_mm));
         out.fading = fading;
         out.faults = self.faults;
         out
@@ -400,6 +408,9 @@ impl HapticCore {
     fn accept_pose(&mut self, pose: &DevicePose, age_s: f64, dt: f64, fading: &mut bool) -> (V3, bool) {
         let stale = age_s.is_nan() || age_s > self.config.max_pose_age_s;
         self.faults.stale_poses += u64::from(stale);
+        if !stale {
+            self.pose_age_s += (age_s.max(0.0) - self.pose_age_s) * (dt / (dt + POSE_AGE_S));
+        }
         let position = finite(pose.position_mm).filter(|p| pose.valid && p.amax() < 1e6);
         self.faults.invalid_poses += u64::from(position.is_none());
         *fading |= stale || position.is_none();
@@ -420,6 +431,17 @@ impl HapticCore {
             self.velocity += (moved / dt - self.velocity) * (dt / (dt + VELOCITY_S));
         }
         (x, jumped)
+    }
+
+    /// K that the device renders passively at the pace at which it answers [N/mm]. Read and given every h, poses are h/2 old on average; what is read
+    /// is given an exchange later at worst and held for one: late by 3 h/2 in all, three times the mean age. A device as quick as its profile says
+    /// has its whole coupling.
+    fn rendered_stiffness(&self) -> f64 {
+        let period = self.config.period_s;
+        // the delay that the coupling was made for: the observer's has a tick more
+        let (half, declared) = (0.5 * period, self.config.pose_delay_ticks.saturating_sub(1) as f64 * period);
+        let late = if self.config.passivity && declared > 0.0 { (3.0 * self.pose_age_s + period).max(declared) } else { declared };
+        self.config.coupling.stiffness_n_per_mm() * (half + declared) / (half + late)
     }
 
     /// Orientation of the tool in this tick; whether it, or the device before, jumped.
@@ -458,7 +480,7 @@ impl HapticCore {
             self.spin += (turned / dt - self.spin) * (dt / (dt + VELOCITY_S));
         }
         if self.config.passivity {
-            self.passivity.turned(V3::from(self.torque_shaper.last_n()).dot(&turned));
+            self.passivity.turned(turned);
         }
         false
     }
@@ -495,7 +517,7 @@ impl HapticCore {
         let (mut force, mut torque, mut buried) = (V3::zeros(), V3::zeros(), 0);
         let mut deepest: Option<(usize, V3, Contact)> = None;
         self.elastic_mj = 0.0;
-        let stiffness = self.config.coupling.stiffness_n_per_mm();
+        let stiffness = self.rendered_stiffness();
         let called: f64 = self.nodes[..count].iter().map(|node| node.called_for(stiffness)).sum();
         let weights: f64 = self.nodes.iter().zip(shape.nodes()).map(|(node, of)| of.share * node.weight()).sum();
         for (n, (node, of)) in self.nodes.iter_mut().zip(shape.nodes()).enumerate() {

@@ -7,7 +7,7 @@ use crate::{
     breathing::Signal,
     error::{Fault, SceneError, Source},
     limits::{LIMITS, range_text},
-    organ,
+    organ, pairs,
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, PhantomKind, Scene, Size},
     sections::{Mode, TouchedSurface},
@@ -152,6 +152,9 @@ fn read(name: &str, text: &str) -> Result<(Scene, Document), SceneError> {
     check_numbers(&document, &scene, &mut faults);
     check_tool(&document, &scene, &mut faults);
     check_tissues(&document, &scene, &mut faults);
+    for (path, message, label, help) in pairs::faults(&scene, document.span("breathing").is_some()) {
+        faults.push(document.fault(&path, message, label, Some(help)));
+    }
     check_effects(&document, &scene, &mut faults);
     let is_volume = scene.rendering.mode == Mode::Volume;
     for (path, message) in organ::faults(&scene.organs, scene.rendering.alone.as_deref(), is_volume) {
@@ -335,14 +338,6 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         }
     }
     check_finite(document, "device.origin_mm", scene.device.origin_mm, faults);
-    if scene.tool.as_ref().is_some_and(|tool| matches!(tool.shape, Shape::Finger | Shape::Probe)) && !scene.has_effect("palpation") {
-        let help = Some("set `palpation = true` under [effects], or use `shape = \"tip\"`".into());
-        faults.push(document.fault("tool.shape", "a tool with a face needs the effect `palpation`", "needs an effect", help));
-    }
-    if scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Blade) && !scene.has_effect("cutting") {
-        let help = Some("set `cutting = true` under [effects], or hold another tool".into());
-        faults.push(document.fault("tool.kind", "a blade is good for nothing without the effect `cutting`", "needs an effect", help));
-    }
     let smooth = scene.has_effect("smooth-surface");
     if scene.haptic.surface.is_some_and(|surface| surface != TouchedSurface::Interpolated) && !smooth {
         let help = Some("set `smooth-surface = true` under [effects], or leave `surface` out".into());
@@ -351,26 +346,6 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     if smooth && scene.tool.as_ref().is_some_and(|tool| tool.shape != Shape::Tip || tool.kind == ToolKind::Needle) {
         let help = Some("use `shape = \"tip\"` and no needle, or take `smooth-surface` out".into());
         faults.push(document.fault("effects.smooth-surface", "a smooth surface is felt with one ball only", "of no use here", help));
-    }
-    let needle = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Needle);
-    if needle != scene.has_effect("needle") {
-        let help = Some("a needle takes `tool.kind = \"needle\"` and `needle = true` under [effects], both".into());
-        let (path, what) = if needle {
-            ("tool.kind", "a needle needs the effect `needle`")
-        } else {
-            ("effects.needle", "the effect `needle` needs a needle to be held")
-        };
-        faults.push(document.fault(path, what, "one of two is missing", help));
-    }
-    let incision = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Incision);
-    if incision != scene.has_effect("incision") {
-        let help = Some("an incision takes `tool.kind = \"incision\"` and `incision = true` under [effects], both".into());
-        let (path, what) = if incision {
-            ("tool.kind", "a tool that takes tissue away needs the effect `incision`")
-        } else {
-            ("effects.incision", "the effect `incision` needs a tool that takes tissue away")
-        };
-        faults.push(document.fault(path, what, "one of two is missing", help));
     }
     scene.incision.voxels.iter().enumerate().for_each(|(c, &n)| {
         check_range(document, &format!("incision.voxels.{c}"), n as f64, [1.0, 64.0], "voxels", faults);
