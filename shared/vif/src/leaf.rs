@@ -36,6 +36,29 @@ pub(crate) enum Kind {
 }
 
 impl Kind {
+    /// By its number, as it is stored.
+    #[inline]
+    pub fn from_number(number: u8) -> Option<Self> {
+        [Self::Constant, Self::Cubic8, Self::Cubic16, Self::Cubic32, Self::Packed, Self::Voxels].get(usize::from(number)).copied()
+    }
+
+    /// Whether bytes are enough for a leaf of this kind of a node of `count` voxels, so that reading it stays inside.
+    #[inline]
+    pub fn fits(self, bytes: &[u8], count: usize) -> bool {
+        let needed = match self {
+            Self::Constant => 4,
+            Self::Cubic8 => 8 + TERMS - 1,
+            Self::Cubic16 => 8 + 2 * (TERMS - 1),
+            Self::Cubic32 => 4 * TERMS,
+            Self::Packed => match bytes.get(6) {
+                Some(&bits) if u32::from(bits) <= MOST_BITS => 7 + count * usize::from(bits) / 8 + 3,
+                _ => return false,
+            },
+            Self::Voxels => 2 * count,
+        };
+        bytes.len() >= needed
+    }
+
     /// Whether the leaf holds voxels, not a polynomial.
     pub fn is_raw(self) -> bool {
         matches!(self, Self::Packed | Self::Voxels)
