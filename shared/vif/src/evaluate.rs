@@ -10,7 +10,7 @@
 use crate::{
     block::{BLOCK, VOXELS},
     gram::{Basis, DEGREES},
-    leaf::{decode_cubic, expand, raw_voxel},
+    leaf::{decode_cubic, expand, expand_rows, raw_row, raw_voxel},
     merge::Axis,
     octree::{LeafView, Octree},
 };
@@ -230,6 +230,31 @@ pub(crate) fn block_values(tree: &(impl Tree + ?Sized), first: [usize; 3], out: 
         expand(mean, &c, local.map(|l| l.0), local.map(|l| l.1), out);
     }
     extent
+}
+
+/// The same for the rows of a box alone (j and k within the block): what a reader of a box looks at.
+#[inline(always)]
+pub(crate) fn block_rows(
+    tree: &(impl Tree + ?Sized),
+    first: [usize; 3],
+    [rows_j, rows_k]: [std::ops::Range<usize>; 2],
+    out: &mut [f32; VOXELS],
+) {
+    let leaf = tree.leaf_of(first);
+    let size = tree.grid_info().grid.size;
+    if leaf.kind.is_raw() {
+        let extent: [usize; 3] = std::array::from_fn(|c| (size[c] - first[c]).min(BLOCK));
+        for k in rows_k {
+            for j in rows_j.clone() {
+                let row = &mut out[(k * BLOCK + j) * BLOCK..][..extent[0]];
+                raw_row(leaf.kind, leaf.bytes, (k * extent[1] + j) * extent[0], row);
+            }
+        }
+    } else {
+        let (mean, c) = decode_cubic(leaf.kind, leaf.bytes);
+        let local = local(tree, &leaf, first.map(|v| v as f64));
+        expand_rows(mean, &c, local.map(|l| l.0), local.map(|l| l.1), [rows_j, rows_k], out);
+    }
 }
 
 /// The voxel nearest to a continuous index.

@@ -4,7 +4,7 @@
 
 use crate::{
     block::{BLOCK, VOXELS},
-    evaluate::{Tree, block_values},
+    evaluate::{Tree, block_rows, block_values},
     octree::Octree,
     vector::{Task, widest},
 };
@@ -184,21 +184,40 @@ pub(crate) fn range_of(tree: &(impl Tree + ?Sized), low: [usize; 3], extent: [us
 
 /// [`Lattice::read`] of an octree.
 pub(crate) fn read_of(tree: &(impl Tree + ?Sized), low: [usize; 3], extent: [usize; 3], [row, slice]: [usize; 2], out: &mut [f32]) {
-    let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
-    let mut values = [0f32; VOXELS];
-    for bk in low[2] / BLOCK..=(end[2] - 1) / BLOCK {
-        for bj in low[1] / BLOCK..=(end[1] - 1) / BLOCK {
-            for bi in low[0] / BLOCK..=(end[0] - 1) / BLOCK {
-                let b = [bi * BLOCK, bj * BLOCK, bk * BLOCK];
-                block_values(tree, b, &mut values);
-                let from: [usize; 3] = std::array::from_fn(|c| low[c].max(b[c]));
-                let to: [usize; 3] = std::array::from_fn(|c| end[c].min(b[c] + BLOCK));
-                for k in from[2]..to[2] {
-                    for j in from[1]..to[1] {
-                        let source = ((k - b[2]) * BLOCK + j - b[1]) * BLOCK + from[0] - b[0];
-                        let target = (k - low[2]) * slice + (j - low[1]) * row + from[0] - low[0];
-                        let count = to[0] - from[0];
-                        out[target..target + count].copy_from_slice(&values[source..source + count]);
+    widest(ReadTree { tree, low, extent, row, slice, out });
+}
+
+/// Values of a box, block by block.
+struct ReadTree<'a, T: ?Sized> {
+    tree: &'a T,
+    low: [usize; 3],
+    extent: [usize; 3],
+    row: usize,
+    slice: usize,
+    out: &'a mut [f32],
+}
+
+impl<T: Tree + ?Sized> Task for ReadTree<'_, T> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { tree, low, extent, row, slice, out } = self;
+        let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
+        let mut values = [0f32; VOXELS];
+        for bk in low[2] / BLOCK..=(end[2] - 1) / BLOCK {
+            for bj in low[1] / BLOCK..=(end[1] - 1) / BLOCK {
+                for bi in low[0] / BLOCK..=(end[0] - 1) / BLOCK {
+                    let b = [bi * BLOCK, bj * BLOCK, bk * BLOCK];
+                    let from: [usize; 3] = std::array::from_fn(|c| low[c].max(b[c]));
+                    let to: [usize; 3] = std::array::from_fn(|c| end[c].min(b[c] + BLOCK));
+                    block_rows(tree, b, [1, 2].map(|c| from[c] - b[c]..to[c] - b[c]), &mut values);
+                    for k in from[2]..to[2] {
+                        for j in from[1]..to[1] {
+                            let source = ((k - b[2]) * BLOCK + j - b[1]) * BLOCK + from[0] - b[0];
+                            let target = (k - low[2]) * slice + (j - low[1]) * row + from[0] - low[0];
+                            let count = to[0] - from[0];
+                            out[target..target + count].copy_from_slice(&values[source..source + count]);
+                        }
                     }
                 }
             }
