@@ -11,6 +11,7 @@
 
 mod breath;
 mod device;
+mod kept;
 mod needle;
 mod needle_port;
 mod operator;
@@ -77,7 +78,11 @@ fn serve<W: Stopwatch>(domain: &Domain, mut life: Life, scene: &Scene, reader: &
     // nothing is mapped, and nothing of it runs, in a scene that does not breathe
     let mut regions = maille_breathing::Regions::open(domain, scene)?;
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
+    // nor one where no octree is kept
+    let kept = kept::Kept::open(domain, scene)?;
+    let octree = kept.as_ref().map(|kept| kept.octree(reader.info())).transpose()?;
     let mut tick = tick::Loop::new(domain, scene, reader, patient, outbox, publisher.thread().clone(), watch)?;
+    tick.feel(octree.as_ref());
 
     let notices = enter_realtime(scene.haptic.priority.min(99) as i32, scene.haptic.cpu);
     for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {

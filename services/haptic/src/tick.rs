@@ -9,8 +9,9 @@ use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
 use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Device, Scene};
-use maille_store::Reader;
+use maille_store::{OctreeLeaves, Reader};
 use maille_transport::{Domain, Life, Stopwatch};
+use maille_vif::{KeptOctree, Voxels};
 use maille_volume::Sampler;
 use std::{sync::Arc, sync::atomic::Ordering::Relaxed, thread::Thread};
 
@@ -25,6 +26,8 @@ pub(crate) struct Loop<'a, W> {
     needle: Option<NeedleStage>,
     /// in a scene whose smooth surface is felt
     smooth: Option<SmoothStage>,
+    /// the octree that it is of, where one is kept; else it is of the voxels
+    octree: Option<&'a KeptOctree<'a>>,
     /// in a scene that breathes
     breather: Option<Breather<'a>>,
     threshold_hu: f64,
@@ -91,6 +94,7 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             watch,
             reader,
             smooth: SmoothStage::new(scene, &rest, config.radius_mm)?,
+            octree: None,
             needle,
             core: HapticCore::new(config),
             operator: Operator::new(tool, scene.haptic.rate_hz, way, real),
@@ -109,6 +113,11 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             residual_mm: None,
             unmapped: false,
         })
+    }
+
+    /// From now on the smooth surface is that of an octree and of the leaves that commits brought.
+    pub fn feel(&mut self, octree: Option<&'a KeptOctree<'a>>) {
+        self.octree = octree;
     }
 
     /// Goes on from where a haptic process that died left the tip, so that tissue which the tip is still in is felt from the wall it came
@@ -152,7 +161,13 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         let moving = moment.as_mut().map(|moment| moment as &mut dyn MovingTissue);
         let mut out = match &mut self.smooth {
             Some(smooth) => {
-                smooth.prepare(&snapshot, epoch, pose.position_mm, threshold_hu);
+                match self.octree {
+                    Some(octree) => {
+                        let octree = octree.live(|id| snapshot.channel::<OctreeLeaves>(id));
+                        smooth.prepare(&octree, &snapshot, epoch, pose.position_mm, threshold_hu);
+                    }
+                    None => smooth.prepare(&Voxels(&snapshot), &snapshot, epoch, pose.position_mm, threshold_hu),
+                }
                 let surface = smooth.surface(&snapshot, threshold_hu);
                 let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s, release };
                 let out = self.core.tick_in(&inputs, moving);

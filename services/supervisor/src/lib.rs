@@ -29,8 +29,9 @@ pub mod labels;
 pub mod memory;
 pub mod needle;
 mod needle_plot;
+pub mod octree;
 mod output;
-mod patient;
+pub mod patient;
 mod process;
 pub mod report;
 pub mod restart;
@@ -50,7 +51,7 @@ use fronts::Fronts;
 use maille_contract::Role;
 use maille_scene::{Device, Scene};
 use signals::Signals;
-use simulation::Simulation;
+use simulation::{Ready, Simulation};
 use std::{
     fs,
     path::{Path, PathBuf},
@@ -123,16 +124,22 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
         Some(patient) => patient::breath(&scene, &patient.0.info.grid, &mut signals)?.map(|breath| (patient, breath)),
         None => None,
     };
-    let Some((patient, breath)) = loaded else {
+    let loaded = match loaded {
+        Some((patient, breath)) => {
+            octree::build(&scene, patient, &mut signals)?.map(|(patient, octree)| (patient, Ready { breath, octree }))
+        }
+        None => None,
+    };
+    let Some((patient, ready)) = loaded else {
         let ended_by = signals.received().unwrap_or("signal").to_owned();
         return finish(RunReport { ended_by, ..names }, options);
     };
     for notice in &patient.1 {
         eprintln!("maille: {notice}");
     }
-    let mut simulation = Simulation::create(scene, &patient, breath.as_ref(), &options.by_hand)?;
+    let mut simulation = Simulation::create(scene, &patient, &ready, &options.by_hand)?;
     say!("domain       {}", simulation.domain());
-    drop((patient, breath));
+    drop((patient, ready));
 
     simulation.control.timed.store(u64::from(options.stages), Relaxed);
     simulation.begin();

@@ -83,6 +83,7 @@ pub static LIMITS: &[Limit] = limits! {
     haptic.ramp_s: 0 ..= 10 ["s"] |s| Some(s.haptic.ramp_s);
     haptic.fade_s: 0 ..= 10 ["s"] |s| Some(s.haptic.fade_s);
     haptic.move_step_mm: 0 ..= 10 ["mm"] |s| Some(s.haptic.move_step_mm);
+    haptic.octree_hu: 0 ..= 1000 ["HU"] |s| Some(s.haptic.octree_hu);
     haptic.state_hz: 1 ..= 1000 ["Hz"] |s| Some(s.haptic.state_hz);
     haptic.cpu: 0 ..= 1023 [""] |s| s.haptic.cpu.map(|n| n as f64);
     haptic.priority: 0 ..= 99 [""] |s| Some(s.haptic.priority.into());

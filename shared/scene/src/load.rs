@@ -347,6 +347,15 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some("use `shape = \"tip\"` and no needle, or take `smooth-surface` out".into());
         faults.push(document.fault("effects.smooth-surface", "a smooth surface is felt with one ball only", "of no use here", help));
     }
+    if scene.has_effect("octree") && scene.haptic.surface == Some(TouchedSurface::Interpolated) {
+        let help = Some("leave `surface` out, or `octree`".into());
+        faults.push(document.fault(
+            "effects.octree",
+            "nobody looks at an octree where the interpolated voxels are felt",
+            "of no use here",
+            help,
+        ));
+    }
     scene.incision.voxels.iter().enumerate().for_each(|(c, &n)| {
         check_range(document, &format!("incision.voxels.{c}"), n as f64, [1.0, 64.0], "voxels", faults);
     });

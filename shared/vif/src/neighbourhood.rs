@@ -10,7 +10,7 @@
 //! Not here: which point to follow, and what is felt beyond the box.
 
 use crate::{
-    lattice::Voxels,
+    lattice::{Lattice, Voxels},
     spline::{Spline, Window},
 };
 use maille_volume::{BrickSource, Grid, brick::EDGE};
@@ -45,14 +45,16 @@ impl Neighbourhood {
             return None;
         }
         let mut new = Self { spline: Spline::default(), window, half, middle: None, stamps: [0; _], epoch: 0 };
-        new.load(source, [0; 3]);
+        new.load(&Voxels(source), source, [0; 3]);
         new.middle = None;
         Some(new)
     }
 
     /// Makes the spline right around a continuous index, as bricks are at `epoch`; whether it had to be loaded. A point that is not finite changes
     /// nothing.
-    pub fn follow(&mut self, source: &impl BrickSource, epoch: u64, index: [f64; 3]) -> bool {
+    ///
+    /// Coefficients are made from `lattice`, which is that of the source or changes with its bricks.
+    pub fn follow(&mut self, lattice: &impl Lattice, source: &impl BrickSource, epoch: u64, index: [f64; 3]) -> bool {
         if !index.iter().all(|v| v.is_finite() && v.abs() < 1e9) {
             return false;
         }
@@ -70,7 +72,7 @@ impl Neighbourhood {
             }
         }
         self.epoch = epoch;
-        self.load(source, near.unwrap_or(index.map(|v| v.round() as isize)));
+        self.load(lattice, source, near.unwrap_or(index.map(|v| v.round() as isize)));
         true
     }
 
@@ -79,14 +81,14 @@ impl Neighbourhood {
         &self.spline
     }
 
-    fn load(&mut self, source: &impl BrickSource, middle: [isize; 3]) {
+    fn load(&mut self, lattice: &impl Lattice, source: &impl BrickSource, middle: [isize; 3]) {
         self.middle = Some(middle);
         let mut stamps = [0; SPAN * SPAN * SPAN];
         self.each_brick(source, middle, |n, stamp| stamps[n] = stamp);
         self.stamps = stamps;
         let first = std::array::from_fn(|c| middle[c] - self.half[c]);
         let extent = self.half.map(|h| (2 * h + 2) as usize);
-        self.spline.load(&Voxels(source), self.window, first, extent);
+        self.spline.load(lattice, self.window, first, extent);
     }
 
     /// Number (in `stamps`) and version of each brick that coefficients around a voxel are made from.
@@ -130,7 +132,7 @@ mod tests {
         for n in 0..600 {
             let t = f64::from(n) * 0.01;
             let at = [35.0 + 33.0 * t.sin(), 31.0 + 31.0 * (1.3 * t).cos(), 24.0 + 22.0 * (0.7 * t).sin()];
-            loads += usize::from(near.follow(&bricks, 1, at));
+            loads += usize::from(near.follow(&Voxels(&bricks), &bricks, 1, at));
             steps += 1;
             for side in [[-3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [1.7, -1.7, 1.7], [0.0, 0.0, -3.0], [0.0; 3]] {
                 let p: [f64; 3] = std::array::from_fn(|c| at[c] + side[c] / [0.8, 1.0, 1.5][c]);
@@ -138,7 +140,7 @@ mod tests {
             }
         }
         assert!(loads < steps / 2, "{loads} loads in {steps} steps");
-        assert!(!near.follow(&bricks, 2, [f64::NAN; 3]));
+        assert!(!near.follow(&Voxels(&bricks), &bricks, 2, [f64::NAN; 3]));
     }
 
     /// Bricks that tell another version.
@@ -167,10 +169,10 @@ mod tests {
         let mut near = Neighbourhood::new(&bricks, Window::Five, 2.0).expect("a small reach");
         assert!(near.follow(&Stamped(&bricks, id([0; 3]), 0), 1, at), "the first");
         assert!(!near.follow(&Stamped(&bricks, id([0; 3]), 7), 2, at), "far away");
-        assert!(near.follow(&Stamped(&bricks, id([40, 40, 24]), 7), 3, at), "here");
-        assert!(!near.follow(&Stamped(&bricks, id([40, 40, 24]), 7), 4, at), "seen");
+        assert!(near.follow(&Voxels(&bricks), &Stamped(&bricks, id([40, 40, 24]), 7), 3, at), "here");
+        assert!(!near.follow(&Voxels(&bricks), &Stamped(&bricks, id([40, 40, 24]), 7), 4, at), "seen");
         // only its noise filter reaches so far
-        assert!(near.follow(&Stamped(&bricks, id([48, 40, 24]), 9), 5, at), "beside it");
+        assert!(near.follow(&Voxels(&bricks), &Stamped(&bricks, id([48, 40, 24]), 9), 5, at), "beside it");
         assert!(Neighbourhood::new(&bricks, Window::Five, 60.0).is_none());
     }
 }
