@@ -167,8 +167,8 @@ mod tests {
         let at = [40.0, 40.0, 24.0];
         let id = |at: [usize; 3]| bricks.layout().brick_of(at[0], at[1], at[2]);
         let mut near = Neighbourhood::new(&bricks, Window::Five, 2.0).expect("a small reach");
-        assert!(near.follow(&Stamped(&bricks, id([0; 3]), 0), 1, at), "the first");
-        assert!(!near.follow(&Stamped(&bricks, id([0; 3]), 7), 2, at), "far away");
+        assert!(near.follow(&Voxels(&bricks), &Stamped(&bricks, id([0; 3]), 0), 1, at), "the first");
+        assert!(!near.follow(&Voxels(&bricks), &Stamped(&bricks, id([0; 3]), 7), 2, at), "far away");
         assert!(near.follow(&Voxels(&bricks), &Stamped(&bricks, id([40, 40, 24]), 7), 3, at), "here");
         assert!(!near.follow(&Voxels(&bricks), &Stamped(&bricks, id([40, 40, 24]), 7), 4, at), "seen");
         // only its noise filter reaches so far
