@@ -8,7 +8,7 @@
 //! With `haptic.surface = "patch"` the normal is that of the bi-cubic patch around the last foot [Shimizu & Nakamura, eq. 6 to 8]. It is blended into the
 //! function's own over the outer half of the patch's reach; where no patch is found the function's own normal is felt, and that is counted.
 //!
-//! Units: mm, HU; reference space. Cost: 0.06 µs a sample, 7 to 10 µs a load, 5 µs a patch (`--example continuity` of `maille-vif`). Allocation: none after `new`.
+//! Units: mm, HU; reference space. Cost: 0.06 µs a sample, 5 to 10 µs a load, 5 µs a patch (`--example continuity` of `maille-vif`). Allocation: none after `new`.
 
 use crate::HapticError;
 use maille_contact::{Isosurface, Surface, TickOutputs};

@@ -69,16 +69,16 @@ struct Shell {
 
 impl ScalarFunction for Shell {
     fn value(&self, at: [f64; 3]) -> f64 {
-        self.half - (self.from_center(at) - self.radius).abs()
+        self.half - (self.off_center(at) - self.radius).abs()
     }
     fn gradient(&self, at: [f64; 3]) -> [f64; 3] {
-        let r = self.from_center(at);
+        let r = self.off_center(at);
         std::array::from_fn(|c| -(at[c] - CENTER[c]) / r * (r - self.radius).signum())
     }
 }
 
 impl Shell {
-    fn from_center(&self, at: [f64; 3]) -> f64 {
+    fn off_center(&self, at: [f64; 3]) -> f64 {
         (0..3).map(|c| (at[c] - CENTER[c]).powi(2)).sum::<f64>().sqrt()
     }
 }
