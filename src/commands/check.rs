@@ -70,6 +70,7 @@ pub fn run(args: &Args) -> Outcome {
     if let Some(motion) = &args.motion {
         scene.use_motion(motion.clone()).map_err(report)?;
     }
+    super::vet::scene(&scene).map_err(Failure::Refused)?;
     let patient = Patient::of(&scene.volume.source())?;
     let grid = &patient.info().grid;
     let cores = std::thread::available_parallelism().map_or(1, usize::from);

@@ -1,7 +1,7 @@
 //! From the scene's tables to the contact engine's configuration.
 
 use maille_contact::{Coupling, CouplingError, DeviceProfile, HapticConfig, Limits, Material, TissueTable, ToolShape};
-use maille_scene::{Scene, Shape, Tissue, Tool, ToolKind};
+use maille_scene::{Device, Scene, Shape, Tissue, Tool, ToolKind};
 
 /// Damping of a device of the Touch class [N·s/mm] (5 N·s/m, CHAI3D's table of devices): what the coupling may count on
 /// while no real device says otherwise.
@@ -17,7 +17,10 @@ pub(crate) fn config(scene: &Scene, tool: &Tool, device: Option<&DeviceProfile>)
     let period_s = 1.0 / h.rate_hz;
     let (stiffness, damping) = (h.contact_stiffness_n_per_mm, h.contact_damping_n_s_per_mm);
     let (mut config, lowered) = match device {
-        Some(device) => HapticConfig::on_device(tool.radius_mm, stiffness, damping, period_s, device)?,
+        Some(device) => {
+            let scale = if is_scaled(&tool.device) { scene.device.scale.unwrap_or(1.0) } else { 1.0 };
+            HapticConfig::on_scaled_device(tool.radius_mm, stiffness, damping, period_s, device, scale)?
+        }
         None => {
             let (coupling, lowered) = Coupling::lowered(stiffness, damping, DEVICE_DAMPING_N_S_PER_MM, period_s)?;
             (HapticConfig::new(tool.radius_mm, coupling), lowered)
@@ -35,6 +38,11 @@ pub(crate) fn config(scene: &Scene, tool: &Tool, device: Option<&DeviceProfile>)
     let max_force_n = device.map_or(h.max_force_n, |device| h.max_force_n.min(device.max_force_n));
     config.limits = Limits { max_force_n, max_slew_n_per_s: h.max_slew_n_per_s, ramp_s: h.ramp_s, fade_s: h.fade_s };
     Ok((config, lowered))
+}
+
+/// Whether `[device] scale` is of this device: simulated hands hold the tool itself.
+pub(crate) fn is_scaled(device: &Device) -> bool {
+    matches!(device, Device::Real(_) | Device::External)
 }
 
 /// The table's rows as plateaus: a row's law holds over its whole range, and changes to the next over the last tenth of it.

@@ -40,12 +40,16 @@ pub(crate) struct Loop<'a, W> {
     last: Option<TickOutputs>,
     /// faults that others know of
     told: Faults,
+    /// exchanges with a real device that others know of
+    exchanges: [u64; 3],
     /// the process that moves tissue is dead, starting, or silent
     tissue_stands: bool,
     refused: u64,
     /// what the last tick's inversion left [mm]; none where none was asked for, or none was found
     residual_mm: Option<f64>,
     unmapped: bool,
+    /// millimetres of the patient for one of a device's, whose lever is so much longer
+    scale: f64,
 }
 
 impl<'a, W: Stopwatch> Loop<'a, W> {
@@ -60,12 +64,12 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         watch: W,
     ) -> Result<Self, HapticError> {
         let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
-        let real = device::kind(tool).map(|kind| device::options(scene).map(|options| (kind, options))).transpose()?;
+        let real = device::kind(tool).map(|kind| device::options(scene, Some(kind)).map(|options| (kind, options))).transpose()?;
         let profile = match (&tool.device, &real) {
             (_, Some((kind, options))) => Some(maille_device::profile(*kind, options)),
             (Device::Sim, None) => Some(simulated_profile(&tool.hand, scene.haptic.max_force_n, scene.haptic.rate_hz)),
             // its owner says what it is, or guards the port itself
-            (Device::External, None) => device::options(scene)?.profile,
+            (Device::External, None) => device::options(scene, None)?.profile,
             _ => None,
         };
         let (config, lowered) = setup::config(scene, tool, profile.as_ref()).map_err(|e| HapticError::Scene(e.to_string()))?;
@@ -76,6 +80,8 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
                 config.coupling.damping_n_s_per_mm()
             );
         }
+        let scale = if setup::is_scaled(&tool.device) { scene.device.scale.unwrap_or(1.0) } else { 1.0 };
+        let is_device = real.is_some() || tool.device == Device::External;
         let rest = reader.rest();
         let sampler = Sampler::new(&rest);
         let way =
@@ -88,7 +94,8 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             &reader.info().grid,
             config.limits,
             profile.as_ref(),
-            real.as_ref().and(profile.as_ref()).map(|p| p.max_torque_n_mm),
+            // a device that says nothing of itself gets none
+            is_device.then(|| profile.as_ref().map_or(0.0, |p| p.max_torque_n_mm * scale)),
         )?;
         Ok(Self {
             watch,
@@ -108,10 +115,12 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             publisher,
             last: None,
             told: Faults::default(),
+            exchanges: [0; 3],
             tissue_stands: false,
             refused: 0,
             residual_mm: None,
             unmapped: false,
+            scale,
         })
     }
 
@@ -234,7 +243,8 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         self.ticks += 1;
         if self.operator.is_external() {
             let (sequence, incarnation) = (self.ticks, life.incarnation());
-            life.control().device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence, incarnation, force_n: out.force_n });
+            let (force_n, torque_n_mm) = (out.force_n, out.torque_n_mm.map(|t| t / self.scale));
+            life.control().device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence, incarnation, force_n, torque_n_mm });
         }
     }
 
@@ -338,6 +348,12 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
                 (Counter::AbsurdForces, now.absurd_forces, told.absurd_forces),
             ] {
                 cell.count(counter, now.saturating_sub(told));
+            }
+        }
+        if let Some(now) = self.operator.exchanges() {
+            let told = std::mem::replace(&mut self.exchanges, now);
+            for (n, counter) in [Counter::DeviceExchanges, Counter::DeviceLate, Counter::DeviceOpened].into_iter().enumerate() {
+                cell.count(counter, now[n].saturating_sub(told[n]));
             }
         }
         cell.count(Counter::TimeBackwards, self.operator.took_backwards());

@@ -70,6 +70,9 @@ pub(crate) use say;
 /// How long the end of a run waits for somebody to read what it says.
 const LAST_WORDS: Duration = Duration::from_millis(500);
 
+/// See [`RunOptions::vet`].
+pub type Vet = fn(&Scene) -> Result<(), String>;
+
 /// What to run and how.
 #[derive(Clone, Debug, Default)]
 pub struct RunOptions {
@@ -93,6 +96,8 @@ pub struct RunOptions {
     pub stages: bool,
     /// measured fronts for `accuracy = "auto"`, in place of those that come with the program
     pub fronts: Option<PathBuf>,
+    /// looks whether this machine has what a scene names, before anything is made; why not, in one sentence
+    pub vet: Option<Vet>,
 }
 
 /// Runs a scene to its end: duration, SIGINT, SIGTERM, SIGHUP, or a service that cannot live. Main thread only: the kernel ends
@@ -111,6 +116,9 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     }
     if let Some(motion) = &options.motion {
         scene.use_motion(motion.clone())?;
+    }
+    if let Some(vet) = options.vet {
+        vet(&scene).map_err(SupervisorError::Refused)?;
     }
     scene.console.enabled &= !options.headless;
     let fronts = Fronts::open(options.fronts.as_deref())?;

@@ -273,6 +273,10 @@ fn resolve(scene: &mut Scene, plan: &Plan, volume: &Volume) -> Result<(), Superv
     if let Some(labels) = &scene.volume.labels {
         scene.volume.labels = Some(absolute(labels)?);
     }
+    // one that has no folder is the system's to find
+    if let Some(library) = scene.device.library.as_ref().filter(|library| library.components().count() > 1) {
+        scene.device.library = Some(absolute(library)?);
+    }
     if let Some(model) = &scene.breathing.model {
         scene.breathing.model = Some(absolute(model)?);
     }

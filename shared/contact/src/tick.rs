@@ -79,6 +79,9 @@ pub struct HapticConfig {
     pub max_torque_n_mm: f64,
     /// see `max_torque_n_mm`
     pub max_torque_slew_n_mm_per_s: f64,
+    /// s: millimetres of the patient for one of the hand. What the device gets is the force as it is and the torque over s (a lever is 1/s longer in the
+    /// hand), so that both come from one potential; energies at its port, its encoder, mass and damping, are the hand's, in the hand's millimetres
+    pub patient_mm_per_hand_mm: f64,
 }
 
 impl HapticConfig {
@@ -105,6 +108,7 @@ impl HapticConfig {
             handle_mm: [0.0; 3],
             max_torque_n_mm: 0.0,
             max_torque_slew_n_mm_per_s: 0.0,
+            patient_mm_per_hand_mm: 1.0,
         }
     }
 
@@ -120,10 +124,28 @@ impl HapticConfig {
         period_s: f64,
         device: &DeviceProfile,
     ) -> Result<(Self, bool), CouplingError> {
-        let stiffness = stiffness_n_per_mm.min(device.max_stiffness_n_per_mm);
+        Self::on_scaled_device(radius_mm, stiffness_n_per_mm, damping_n_s_per_mm, period_s, device, 1.0)
+    }
+
+    /// The same where a millimetre of the hand is `scale` millimetres of the patient: gains are the patient's, at the hand they are `scale` times as
+    /// large, and that is what the device has to render. A scale that is none counts as 1.
+    ///
+    /// # Errors
+    /// As [`HapticConfig::on_device`].
+    pub fn on_scaled_device(
+        radius_mm: f64,
+        stiffness_n_per_mm: f64,
+        damping_n_s_per_mm: f64,
+        period_s: f64,
+        device: &DeviceProfile,
+        scale: f64,
+    ) -> Result<(Self, bool), CouplingError> {
+        let scale = if scale.is_finite() && scale > 0.0 { scale.clamp(0.01, 100.0) } else { 1.0 };
+        let stiffness = stiffness_n_per_mm.min(device.max_stiffness_n_per_mm / scale);
         let (coupling, lowered) =
-            Coupling::lowered_delayed(stiffness, damping_n_s_per_mm, device.damping_n_s_per_mm, period_s, device.delay_s)?;
+            Coupling::lowered_delayed(stiffness, damping_n_s_per_mm, device.damping_n_s_per_mm / scale, period_s, device.delay_s)?;
         let mut config = Self::new(radius_mm, coupling);
+        config.patient_mm_per_hand_mm = scale;
         config.period_s = period_s;
         config.limits.max_force_n = device.max_force_n;
         config.passivity = true;
@@ -132,9 +154,9 @@ impl HapticConfig {
         config.pose_quantum_mm = device.quantum_mm;
         config.device_mass_kg = device.mass_kg;
         config.device_damping_n_s_per_mm = device.damping_n_s_per_mm;
-        config.max_torque_n_mm = device.max_torque_n_mm;
+        config.max_torque_n_mm = device.max_torque_n_mm * scale;
         // as the force: its whole range in some 30 ms
-        config.max_torque_slew_n_mm_per_s = 30.0 * device.max_torque_n_mm;
+        config.max_torque_slew_n_mm_per_s = 30.0 * config.max_torque_n_mm;
         Ok((config, lowered || stiffness < stiffness_n_per_mm))
     }
 }
@@ -246,6 +268,8 @@ impl HapticCore {
     pub fn new(config: HapticConfig) -> Self {
         let mut config = config;
         config.blend_s = if config.blend_s.is_finite() { config.blend_s.clamp(0.01, 1.0) } else { 0.02 };
+        let scale = config.patient_mm_per_hand_mm;
+        config.patient_mm_per_hand_mm = if scale.is_finite() && scale > 0.0 { scale.clamp(0.01, 100.0) } else { 1.0 };
         config.period_s = if config.period_s.is_finite() { config.period_s.clamp(1e-5, MAX_STEP_S) } else { 1e-3 };
         if config.shape.nodes().len() == 1 && config.shape.nodes()[0].offset_mm == [0.0; 3] {
             // a radius set after `HapticConfig::new`
@@ -371,16 +395,19 @@ impl HapticCore {
         out.torque_n_mm = self.torque_shaper.shape(self.last_torque.into(), step, fading);
         if self.config.passivity && self.position.is_some() {
             // after the limits: a fall that the slew limit would stretch may be more than is stored
-            let port = moving.as_ref().map_or(x, |moving| V3::from(moving.port_mm()));
+            // what the device does is measured in its own millimetres: its encoder's steps, its mass, the work of the hand
+            let in_hand = 1.0 / self.config.patient_mm_per_hand_mm;
+            let port = moving.as_ref().map_or(x, |moving| V3::from(moving.port_mm())) * in_hand;
             if let Some(moving) = &moving {
-                self.passivity.grant(given.dot(&V3::from(moving.moved_mm())));
+                self.passivity.grant(given.dot(&V3::from(moving.moved_mm())) * in_hand);
             }
-            let force = self.passivity.control(port, V3::from(out.force_n), V3::from(out.torque_n_mm), self.elastic_mj, dt);
+            let torque = V3::from(out.torque_n_mm) * in_hand;
+            let force = self.passivity.control(port, V3::from(out.force_n), torque, self.elastic_mj * in_hand, dt);
             self.shaper.cut_to(force);
             self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
             (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
         }
-        self.passivity.given(V3::from(out.force_n), V3::from(out.torque_n_mm));
+        self.passivity.given(V3::from(out.force_n), V3::from(out.torque_n_mm) / self.config.patient_mm_per_hand_mm);
         out.fading = fading;
         out.faults = self.faults;
         out
@@ -420,7 +447,8 @@ impl HapticCore {
         };
         let moved = self.position.map_or(V3::zeros(), |last| x - last);
         self.position = Some(x);
-        let jumped = moved.norm() > MAX_JUMP_MM;
+        // no hand moves so far in a tick, and where a hand's way is drawn smaller, not so far in the patient
+        let jumped = moved.norm() > MAX_JUMP_MM * self.config.patient_mm_per_hand_mm.min(1.0);
         if jumped {
             self.faults.jumps += 1;
             self.velocity = V3::zeros();

@@ -50,9 +50,9 @@ fn messages_keep_their_names_sizes_and_offsets() {
 
 #[test]
 fn shared_words_keep_their_sizes_and_offsets() {
-    golden!(ServiceCell, 19_008, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 304, lateness: 9_528, stages: 18_752);
-    golden!(DeviceState, 88, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64);
-    golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
+    golden!(ServiceCell, 19_072, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 368, lateness: 9_592, stages: 18_816);
+    golden!(DeviceState, 120, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64, orientation: 88);
+    golden!(DeviceForce, 72, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24, torque_n_mm: 48);
     golden!(KnobState, 152, turns: 0, given_up: 8, turned: 16, values: 24);
     golden!(Switches, 32, stamp: 0, off: 24);
     golden!(UndoCommand, 32, stamp: 0, undos: 24);

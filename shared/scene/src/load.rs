@@ -77,6 +77,10 @@ impl Scene {
         if let Signal::Recorded(file) = &scene.breathing.signal {
             scene.breathing.signal = Signal::Recorded(document.find_file("breathing.signal", file, &folder, "trace of breathing")?);
         }
+        if let Some(library) = scene.device.library.as_ref().filter(|library| library.components().count() > 1) {
+            // a name alone is looked for where the system has its libraries
+            scene.device.library = Some(document.find_file("device.library", library, &folder, "library")?);
+        }
         if let Some(Device::PathFile(file)) = scene.tool.as_ref().map(|t| &t.device) {
             let found = document.find_file("tool.device", file, &folder, "file of way points")?;
             scene.use_device(Device::PathFile(found))?;
@@ -320,6 +324,19 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some(format!("profiles are {}", PROFILES.join(", ")));
         faults.push(document.fault("device.profile", suggest::unknown("profile", profile, PROFILES), "no such profile", help));
     }
+    if let Some(reason) = scene.device.address.as_deref().and_then(no_address) {
+        let help = Some("write the host and the port of the Haply Inverse Service, as `127.0.0.1:10001` or `[::1]:10001`".into());
+        faults.push(document.fault("device.address", format!("device.address is no address: {reason}"), "no address", help));
+    }
+    let no_name = |text: &str| text.trim().is_empty() || text.contains('\0');
+    if scene.device.id.as_deref().is_some_and(no_name) {
+        let help = Some("write the name that the device was configured with, or leave `id` out for the first there is".into());
+        faults.push(document.fault("device.id", "device.id is no name of a device", "no name", help));
+    }
+    if scene.device.library.as_deref().and_then(Path::to_str).is_some_and(no_name) {
+        let help = Some("write the path of the vendor's shared object, or leave `library` out to have the system find it".into());
+        faults.push(document.fault("device.library", "device.library is no file name", "no file name", help));
+    }
     if let Some(r) = scene.device.rotation {
         let dot = |a: usize, b: usize| (0..3).map(|c| r[a][c] * r[b][c]).sum::<f64>();
         let orthonormal = |a: usize, b: usize| (dot(a, b) - f64::from(u8::from(a == b))).abs() <= 1e-3;
@@ -388,6 +405,31 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     if scene.memory.spare_mib.is_some() && scene.memory.spare_slots.is_some() {
         let help = Some("keep one of `spare_mib` and `spare_slots`".into());
         faults.push(document.fault("memory.spare_slots", "[memory] gives the spare slots twice", "one of them too many", help));
+    }
+}
+
+/// Why a text is not the host and port of a service; none where it may be one. Whether that host exists shows when it is called.
+fn no_address(text: &str) -> Option<String> {
+    if text.contains("://") {
+        return Some("it has a scheme; the host and port alone are wanted".into());
+    }
+    let Some((host, port)) = text.rsplit_once(':') else { return Some("it has no port".into()) };
+    // colons stand in an IPv6 address, which has brackets
+    let (bare, bracketed) = match host.strip_prefix('[').and_then(|h| h.strip_suffix(']')) {
+        Some(bare) => (bare, true),
+        None => (host, false),
+    };
+    let known = if bracketed {
+        bare.parse::<std::net::Ipv6Addr>().is_ok()
+    } else {
+        !bare.is_empty() && bare.len() <= 253 && bare.chars().all(|c| c.is_ascii_alphanumeric() || "-._".contains(c))
+    };
+    if !known {
+        return Some(format!("`{host}` is no host"));
+    }
+    match port.parse::<u16>() {
+        Ok(1..) => None,
+        _ => Some(format!("`{port}` is no port")),
     }
 }
 

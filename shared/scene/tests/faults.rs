@@ -37,6 +37,29 @@ fn an_unknown_word_is_answered_with_the_words_there_are() {
     assert!(error.to_string().contains("sigma.7") || error.to_string().contains("no profile"), "{error}");
     let error = fault("[device]\nrotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]]");
     assert!(error.to_string().contains("no rotation"), "{error}");
+    for (address, what) in [
+        ("nonsense", "no port"),
+        ("127.0.0.1", "no port"),
+        ("127.0.0.1:", "no port"),
+        ("127.0.0.1:0", "`0` is no port"),
+        ("127.0.0.1:70000", "`70000` is no port"),
+        (":10001", "no host"),
+        ("a host:10001", "no host"),
+        ("::1:10001", "no host"),
+        ("[::g]:10001", "no host"),
+        ("ws://127.0.0.1:10001", "scheme"),
+        ("", "no port"),
+    ] {
+        let error = fault(&format!("[device]\naddress = \"{address}\""));
+        assert!(error.to_string().contains("scene.toml:2: device.address is no address") && error.to_string().contains(what), "{error}");
+    }
+    for address in ["127.0.0.1:10001", "localhost:80", "haply_2.local:65535", "[::1]:10001"] {
+        assert!(Scene::parse("scene.toml", &format!("[device]\naddress = \"{address}\"")).is_ok(), "{address}");
+    }
+    for (key, value) in [("id", "  "), ("id", "Default\\u0000Device"), ("library", ""), ("library", "a\\u0000b")] {
+        let error = fault(&format!("[device]\n{key} = \"{value}\""));
+        assert!(error.to_string().contains(&format!("scene.toml:2: device.{key} is no")), "{error}");
+    }
     for mirrored in [
         "[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]",
         "[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]",
