@@ -564,7 +564,7 @@ impl HapticCore {
             self.faults.absurd_forces += u64::from(node.took_absurd());
             self.elastic_mj += felt.elastic_mj;
             if self.config.passivity {
-                self.passivity.grant(felt.granted_mj);
+                self.passivity.grant(felt.granted_mj / self.config.patient_mm_per_hand_mm);
             }
             if let Some((contact, indentation)) = felt.contact {
                 out.nodes |= 1 << n;
