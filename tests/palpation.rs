@@ -225,7 +225,7 @@ fn the_dent_under_a_finger_is_seen_while_the_patient_breathes_and_nothing_else_c
         assert!(patient.listen(&led.control));
         let model = patient.model();
         let motion = Motion::new(&model.fields().iter().map(|f| f.unpack(model.grid())).collect::<Vec<_>>()).unwrap();
-        let mut warp = Warp::new(&info, WarpOptions { tolerance_mm: 0.05, pitch_mm: 6.0 });
+        let mut warp = Warp::new(&info, WarpOptions::default());
         warp.update(&info, &motion, &patient.at(tool.stamp.time_ns).weights().dense(motion.count())).unwrap();
         let own = [drawn(&snapshot, &warp), drawn(&rest, &warp)];
         drop(snapshot);

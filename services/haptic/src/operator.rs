@@ -96,6 +96,11 @@ impl Operator {
         !self.follow_script && self.page.is_none() && matches!(self.holder, Holder::Script)
     }
 
+    /// What part of the force written now the device gives.
+    pub fn gives(&self) -> f64 {
+        if let Holder::Real(device) = &self.holder { device.gives() } else { 1.0 }
+    }
+
     /// Orientation of the tool, where a device knows it.
     pub fn orientation(&self) -> Option<[f64; 4]> {
         if let Holder::Real(device) = &self.holder { device.orientation() } else { self.turned }

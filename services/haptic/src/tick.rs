@@ -160,6 +160,7 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         if let Some(orientation) = orientation {
             self.core.set_orientation(orientation);
         }
+        self.core.set_given(self.operator.gives());
         let snapshot = self.reader.snapshot();
         let epoch = snapshot.epoch();
         // tissue stands as it was committed while its owner is silent: it is felt, and said

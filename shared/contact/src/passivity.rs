@@ -230,11 +230,12 @@ impl Passivity {
         if self.fresh {
             (self.unread, self.unread_s) = (0, 0.0);
         }
-        (self.unread, self.unread_s) = (self.unread + 1, self.unread_s + dt_s);
+        (self.unread, self.unread_s) = ((self.unread + 1).min(MAX_DELAY), self.unread_s + dt_s);
         // the same reading is older by the time that went by
-        self.fresh = age_s < self.age_s + 0.5 * dt_s || self.unread >= MAX_DELAY;
+        self.fresh = age_s < self.age_s + 0.5 * dt_s;
         self.age_s = age_s;
-        if self.fresh {
+        // a longer silence is a device that was away, not its pace
+        if self.fresh && self.unread < MAX_DELAY {
             self.paces = [self.paces[1], self.paces[2], self.unread];
         }
     }

@@ -252,6 +252,8 @@ pub struct HapticCore {
     spin: V3,
     /// mean age of the poses [s]
     pose_age_s: f64,
+    /// part of the force that the device gives
+    gives: f64,
     epoch: Option<u64>,
     threshold: f64,
     /// force before limits at the last tick [N]
@@ -302,6 +304,7 @@ impl HapticCore {
             orientation: None,
             spin: V3::zeros(),
             pose_age_s: 0.0,
+            gives: 1.0,
             epoch: None,
             threshold: f64::NAN,
             last_wanted: V3::zeros(),
@@ -320,6 +323,11 @@ impl HapticCore {
             let q = Quaternion::new(xyzw[3], xyzw[0], xyzw[1], xyzw[2]);
             self.orientation = Some(UnitQuaternion::from_quaternion(q));
         }
+    }
+
+    /// What part of the force of the ticks to come the device really gives, 0 to 1 (while it is away, or rises again): the observer counts that.
+    pub fn set_given(&mut self, part: f64) {
+        self.gives = if part.is_finite() { part.clamp(0.0, 1.0) } else { 1.0 };
     }
 
     /// What it was made with.
@@ -407,7 +415,8 @@ impl HapticCore {
             self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
             (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
         }
-        self.passivity.given(V3::from(out.force_n), V3::from(out.torque_n_mm) / self.config.patient_mm_per_hand_mm);
+        let torque = V3::from(out.torque_n_mm) / self.config.patient_mm_per_hand_mm;
+        self.passivity.given(V3::from(out.force_n) * self.gives, torque * self.gives);
         out.fading = fading;
         out.faults = self.faults;
         out
@@ -468,7 +477,9 @@ impl HapticCore {
         let period = self.config.period_s;
         // the delay that the coupling was made for: the observer's has a tick more
         let (half, declared) = (0.5 * period, self.config.pose_delay_ticks.saturating_sub(1) as f64 * period);
-        let late = if self.config.passivity && declared > 0.0 { (3.0 * self.pose_age_s + period).max(declared) } else { declared };
+        // at an exchange a tick, 3/2 of a period: that is in what is declared
+        let slower = if self.config.passivity && declared > 0.0 { (3.0 * self.pose_age_s - 1.5 * period).max(0.0) } else { 0.0 };
+        let late = declared + slower;
         self.config.coupling.stiffness_n_per_mm() * (half + declared) / (half + late)
     }
 

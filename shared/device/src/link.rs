@@ -94,8 +94,9 @@ struct Shared {
     command: LatestCell<COMMAND_WORDS>,
     stop: AtomicBool,
     connected: AtomicBool,
-    /// times it was opened
+    /// times it was opened, and when it was last [ns]
     opened: AtomicU64,
+    opened_ns: AtomicU64,
     /// exchanges so far, and those that came late
     exchanges: AtomicU64,
     late: AtomicU64,
@@ -139,6 +140,7 @@ impl RemoteDevice {
             stop: AtomicBool::new(false),
             connected: AtomicBool::new(false),
             opened: AtomicU64::new(0),
+            opened_ns: AtomicU64::new(0),
             exchanges: AtomicU64::new(0),
             late: AtomicU64::new(0),
         });
@@ -218,6 +220,10 @@ impl Device for RemoteDevice {
 
     fn pose_age_s(&self) -> f64 {
         if self.seen { monotonic_ns().saturating_sub(self.last.taken_ns) as f64 * 1e-9 } else { f64::INFINITY }
+    }
+
+    fn gives(&self) -> f64 {
+        if self.shared.connected.load(Relaxed) { risen(self.shared.opened_ns.load(Relaxed), monotonic_ns()) } else { 0.0 }
     }
 
     fn status(&self) -> DeviceStatus {
@@ -301,6 +307,7 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
         }
         shared.opened.fetch_add(1, Relaxed);
         let began = monotonic_ns();
+        shared.opened_ns.store(began, Relaxed);
         let mut last_ns = None;
         let opened = Opened(&mut driver, shared);
         while !shared.stop.load(Relaxed) {
@@ -343,10 +350,15 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
     }
 }
 
+/// What part of its force a device gives that was opened then.
+fn risen(opened_ns: u64, now_ns: u64) -> f64 {
+    (now_ns.saturating_sub(opened_ns) as f64 / RISE_NS as f64).min(1.0)
+}
+
 /// The command that the device gets: nothing when the tick is silent, within the profile, and rising after the device came.
 fn safe(given: Option<Command>, now_ns: u64, opened_ns: u64, profile: &DeviceProfile) -> Command {
     let Some(given) = given.filter(|c| now_ns.saturating_sub(c.given_ns) <= SILENT_NS) else { return Command::zeroed() };
-    let rise = (now_ns.saturating_sub(opened_ns) as f64 / RISE_NS as f64).min(1.0);
+    let rise = risen(opened_ns, now_ns);
     let hold = |v: [f64; 3], max: f64| {
         let length = v.iter().map(|c| c * c).sum::<f64>().sqrt();
         if !length.is_finite() || length == 0.0 { [0.0; 3] } else { v.map(|c| c * rise * (max / length).min(1.0)) }

@@ -282,6 +282,7 @@ fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back
             if let Some(q) = device.orientation() {
                 core.set_orientation(q);
             }
+            core.set_given(device.gives());
             n += 1;
             let out = core.tick(&TickInputs {
                 now_ns: n * 1_000_000,
@@ -309,7 +310,8 @@ fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back
     let (mut pressed, mut resting) = (0.0, 0);
     for _ in 0..5000 {
         let f = tick(&mut device, &mut core, 0.1 + 1e-9);
-        resting = if f > 0.5 && (f - pressed).abs() < 1e-6 { resting + 1 } else { 0 };
+        // the coupling goes with the mean age of the poses, which a busy machine moves
+        resting = if f > 0.5 && (f - pressed).abs() < 2e-3 { resting + 1 } else { 0 };
         pressed = f;
         if resting > 100 {
             break;
