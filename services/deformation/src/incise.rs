@@ -6,11 +6,11 @@
 //!
 //! Each element's byte in the channel of cuts numbers the stroke that took it away, so that a process that starts anew can take back what its predecessor cut.
 //! A **stroke** is all that is cut within [`STROKE_NS`] of each other. The last [`UNDOABLE`] strokes can be taken back; an older one stays
-//! ([`FOR_GOOD`]). Taking back a stroke brings the elements' links back, but for those to elements that are still away. Tissue at rest is then what it was bit
-//! for bit. Displaced tissue (of a patient deformed before: the tool itself pushes nothing) is mapped anew, and there a voxel may differ by what the
-//! mapper's tolerance of a hundredth of a voxel is worth, 10 HU at the steepest edges: which answer within it the mapper gives depends on the voxels that it is
-//! asked for together (it goes from row to row), and those are others than when the tissue was pushed. To be exact there too would take a copy of each
-//! brick a stroke, in the store, since a successor has to give the same bits.
+//! ([`FOR_GOOD`]). Taking back a stroke brings the elements' links back, but for those to elements that are still away. What was there is then there again bit for bit:
+//! in a scene with incisions tissue is at rest but for what is cut, for its tool pushes nothing and no other effect that moves tissue goes with it (`needle-drag`
+//! needs a needle, relaxation finds nothing to relax, a threshold that moves links has no displacement to move). Were tissue displaced, as only a caller of this
+//! crate can have it, it would be mapped anew, and a voxel could differ by what the mapper's tolerance of a hundredth of a voxel is worth, 10 HU at the steepest
+//! edges: its answer within that depends on the voxels that it is asked for together.
 //!
 //! Invariant: in a scene with incisions nothing else cuts links (the scene's tool is one), so that a link is cut exactly when one of its ends is away.
 //! Cost: the elements of the box, and the mapper's of so many voxels.

@@ -6,7 +6,7 @@
 
 use maille_breathing::Patient;
 use maille_contract::ControlBlock;
-use maille_motion::{Breath, Collapsed};
+use maille_motion::{Breath, Collapsed, MotionAt};
 use maille_raycast::{Warp, WarpOptions, WarpReport};
 use maille_volume::VolumeInfo;
 
@@ -87,6 +87,11 @@ impl<'a> Breather<'a> {
         self.collapsed.collapse(model, &weights);
         let (longest_mm, contraction) = self.collapsed.bounds(model);
         self.warp.update_field(&self.info, model.grid(), self.collapsed.nodes(), longest_mm, contraction)
+    }
+
+    /// The patient at a simulation time, to be asked at many points.
+    pub fn moment(&self, time_ns: u64) -> MotionAt<'_> {
+        self.patient.at(time_ns)
     }
 
     /// Where a point of the patient at rest is at a simulation time [mm].

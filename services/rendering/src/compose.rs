@@ -1,6 +1,6 @@
 //! A frame: the views drawn, then laid side by side in one sample.
 
-use crate::{backend::Backend, overlay, view::View};
+use crate::{backend::Backend, meshes::Meshes, overlay, view::View};
 use maille_contract::{FrameHeader, Switches, ToolState, messages::ViewRect};
 use maille_raycast::{
     Capsule, Extras, Geometry, Labels, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, ultrasound,
@@ -40,6 +40,8 @@ pub(crate) struct Composer {
     zoom: bool,
     /// the scene's organs
     pub labels: Option<Labels>,
+    /// the scene's meshes, where the patient is
+    pub meshes: Meshes,
 }
 
 impl Composer {
@@ -60,6 +62,7 @@ impl Composer {
             view_ns: 0,
             zoom,
             labels: None,
+            meshes: Meshes::default(),
         }
     }
 
@@ -108,17 +111,19 @@ impl Composer {
         let [whole, sections @ .., fan] = &mut self.pictures;
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
-        let bodies = Geometry { capsules, meshes: &[] };
+        let meshes = self.meshes.views();
+        let bodies = Geometry { capsules, meshes: &meshes };
         let [w, h] = [whole.width, whole.height].map(|n| self.quality.pixels(n));
         // what is thinner than a pixel would be dots where it meets the middles of pixels
         let pixel = 2.0 * (camera.fov_deg.to_radians() / 2.0).tan() / h as f64;
         let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
-        let in_3d = Geometry { capsules: &thick, meshes: &[] };
+        let in_3d = Geometry { capsules: &thick, meshes: &meshes };
+        let inside_tool = Geometry { capsules: &[], meshes: &meshes };
         // an endoscope does not see itself
         let extras = Extras {
             warp,
             labels: self.labels.as_ref(),
-            geometry: Some(&in_3d).filter(|_| !at_tip),
+            geometry: Some(if at_tip { &inside_tool } else { &in_3d }),
             barrel: view.barrel(at_tip),
             zoom: self.zoom,
             ..Extras::default()

@@ -15,6 +15,7 @@ mod compose;
 mod gpu_tests;
 #[cfg(test)]
 mod in_place;
+mod meshes;
 mod needle;
 mod organs;
 mod overlay;
@@ -50,6 +51,8 @@ pub enum RenderingError {
     Transfer { name: String, reason: String },
     #[error("the organ `{name}` cannot be found: {reason}")]
     Organ { name: String, reason: String },
+    #[error("the mesh `{name}` cannot be shown: {reason}")]
+    Mesh { name: String, reason: String },
     #[error("the thread pool could not be made: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
 }
@@ -98,6 +101,7 @@ fn frames<W: Stopwatch + Send>(
     let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm)));
     composer.backend = backend::Backend::of(scene, reader);
     composer.labels = pool.install(|| organs::labels(scene, &reader.rest()))?;
+    composer.meshes = pool.install(|| meshes::Meshes::of(scene, &reader.rest()))?;
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
     let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
@@ -177,6 +181,10 @@ fn frames<W: Stopwatch + Send>(
         let mut warp_ns = 0;
         let drawn = pool.install(|| {
             watch.start();
+            if let Some(breather) = breather.as_ref().filter(|_| !composer.meshes.is_empty()) {
+                let moment = breather.moment(time_ns);
+                composer.meshes.carry(|at| moment.to_world(at));
+            }
             let warp = breather.as_mut().map(|breather| breather.go(time_ns));
             warp_ns = monotonic_ns() - now;
             watch.split("warp");

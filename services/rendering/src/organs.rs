@@ -6,7 +6,7 @@
 use crate::RenderingError;
 use maille_raycast::Labels;
 use maille_scene::{BoxMm, Scene};
-use maille_surface::{Selection, organ};
+use maille_surface::{Organ, Selection, organ};
 use maille_volume::BrickSource;
 
 /// Labels of the scene's organs, numbered from 1; `None` in a scene without. With `rendering.alone` everything else lets light through.
@@ -15,22 +15,9 @@ pub(crate) fn labels(scene: &Scene, rest: &impl BrickSource) -> Result<Option<La
         return Ok(None);
     }
     let grid = &rest.info().grid;
-    let bounds = BoxMm::of(grid);
     let mut voxels = vec![0u8; grid.voxel_count()];
     for (n, said) in scene.organs.iter().enumerate() {
-        let fault = |reason: String| RenderingError::Organ { name: said.name.clone(), reason };
-        let seed = match said.seed_mm.or(said.seed.map(|fraction| bounds.at(fraction))) {
-            None => None,
-            Some(mm) => {
-                let index = grid.index_from_world(mm).map(f64::round);
-                if !(0..3).all(|c| index[c] >= 0.0 && index[c] < grid.size[c] as f64) {
-                    return Err(fault(format!("its seed {mm:.1?} mm lies outside the volume")));
-                }
-                Some(index.map(|v| v as usize))
-            }
-        };
-        let selection = Selection { ranges: said.hu.clone(), seed, smallest_mm3: said.islands_mm3 };
-        let found = organ(rest, &selection).map_err(|e| fault(e.to_string()))?;
+        let found = find(said, rest)?;
         for (label, inside) in voxels.iter_mut().zip(&found.labels) {
             if *inside != 0 {
                 *label = n as u8 + 1;
@@ -46,6 +33,24 @@ pub(crate) fn labels(scene: &Scene, rest: &impl BrickSource) -> Result<Option<La
         labels.colors[number][3] = 0.0;
     }
     Ok(Some(labels))
+}
+
+/// One organ of a scene.
+pub(crate) fn find(said: &maille_scene::Organ, rest: &impl BrickSource) -> Result<Organ, RenderingError> {
+    let grid = &rest.info().grid;
+    let fault = |reason: String| RenderingError::Organ { name: said.name.clone(), reason };
+    let seed = match said.seed_mm.or(said.seed.map(|fraction| BoxMm::of(grid).at(fraction))) {
+        None => None,
+        Some(mm) => {
+            let index = grid.index_from_world(mm).map(f64::round);
+            if !(0..3).all(|c| index[c] >= 0.0 && index[c] < grid.size[c] as f64) {
+                return Err(fault(format!("its seed {mm:.1?} mm lies outside the volume")));
+            }
+            Some(index.map(|v| v as usize))
+        }
+    };
+    let selection = Selection { ranges: said.hu.clone(), seed, smallest_mm3: said.islands_mm3 };
+    organ(rest, &selection).map_err(|e| fault(e.to_string()))
 }
 
 #[cfg(test)]

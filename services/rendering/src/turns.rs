@@ -1,6 +1,6 @@
 //! Frames one by one, without the loop's rate and its publishing: for measuring what a frame takes. The calling thread's pool draws.
 
-use crate::{RenderingError, breath::Breather, compose::Composer, organs, view::View};
+use crate::{RenderingError, breath::Breather, compose::Composer, meshes, organs, view::View};
 use maille_breathing::Patient;
 use maille_contract::ToolState;
 use maille_scene::{BoxMm, Scene};
@@ -26,6 +26,7 @@ impl<'a> Turns<'a> {
         let breather = patient.map(|patient| Breather::new(patient, reader.info(), scene.breathing.picture_tolerance_mm));
         let mut composer = Composer::new(scene);
         composer.labels = organs::labels(scene, &reader.rest())?;
+        composer.meshes = meshes::Meshes::of(scene, &reader.rest())?;
         Ok(Self { control: ControlMap::open(domain)?, reader, composer, view, breather })
     }
 
@@ -33,6 +34,10 @@ impl<'a> Turns<'a> {
     pub fn frame(&mut self, time_ns: u64) -> bool {
         let tool = self.control.tool.load::<ToolState>().map(|(tool, _)| tool);
         let snapshot = self.reader.snapshot();
+        if let Some(breather) = self.breather.as_ref().filter(|_| !self.composer.meshes.is_empty()) {
+            let moment = breather.moment(time_ns);
+            self.composer.meshes.carry(|at| moment.to_world(at));
+        }
         let warp = self.breather.as_mut().map(|breather| breather.go(time_ns));
         self.composer.draw(&snapshot, warp, &self.view, tool.as_ref(), tool.is_some(), None, &mut Untimed).is_ok()
     }

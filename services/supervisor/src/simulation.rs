@@ -280,6 +280,9 @@ fn resolve(scene: &mut Scene, plan: &Plan, volume: &Volume) -> Result<(), Superv
     if let Some(model) = &scene.breathing.model {
         scene.breathing.model = Some(absolute(model)?);
     }
+    for file in scene.meshes.iter_mut().filter_map(|mesh| mesh.file.as_mut()) {
+        *file = absolute(file)?;
+    }
     if let Signal::Recorded(file) = &scene.breathing.signal {
         scene.breathing.signal = Signal::Recorded(absolute(file)?);
     }

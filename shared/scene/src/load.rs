@@ -7,7 +7,7 @@ use crate::{
     breathing::Signal,
     error::{Fault, SceneError, Source},
     limits::{LIMITS, range_text},
-    organ, pairs,
+    mesh, organ, pairs,
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, PhantomKind, Scene, Size},
     sections::{Mode, TouchedSurface},
@@ -65,6 +65,9 @@ impl Scene {
         }
         if let Some(labels) = &scene.volume.labels {
             scene.volume.labels = Some(document.find_file("volume.labels", labels, &folder, "label map")?);
+        }
+        for (n, file) in scene.meshes.iter_mut().enumerate().filter_map(|(n, mesh)| Some((n, mesh.file.as_mut()?))) {
+            *file = document.find_file(&format!("mesh.{n}.file"), file, &folder, "mesh")?;
         }
         let transfer = PathBuf::from(&scene.rendering.transfer);
         if !TRANSFER_PRESETS.contains(&scene.rendering.transfer.as_str()) {
@@ -162,6 +165,9 @@ fn read(name: &str, text: &str) -> Result<(Scene, Document), SceneError> {
     check_effects(&document, &scene, &mut faults);
     let is_volume = scene.rendering.mode == Mode::Volume;
     for (path, message) in organ::faults(&scene.organs, scene.rendering.alone.as_deref(), is_volume) {
+        faults.push(document.fault(&path, message, "here", None));
+    }
+    for (path, message) in mesh::faults(&scene.meshes, &scene.organs) {
         faults.push(document.fault(&path, message, "here", None));
     }
     document.refuse(faults)?;

@@ -3,6 +3,7 @@
 use crate::{
     breathing::Breathing,
     incision::Incision,
+    mesh::Mesh,
     needle::Needle,
     organ::Organ,
     sections::{Console, Deformation, Haptic, Memory, Rendering, TouchedSurface},
@@ -199,6 +200,9 @@ pub struct Scene {
     /// parts of the patient by their values
     #[serde(rename = "organ", skip_serializing_if = "Vec::is_empty")]
     pub organs: Vec<Organ>,
+    /// surfaces among the voxels
+    #[serde(rename = "mesh", skip_serializing_if = "Vec::is_empty")]
+    pub meshes: Vec<Mesh>,
 }
 
 impl Default for Scene {
@@ -221,6 +225,7 @@ impl Default for Scene {
             effects: BTreeMap::new(),
             tissues: tissue::defaults(),
             organs: Vec::new(),
+            meshes: Vec::new(),
         }
     }
 }
