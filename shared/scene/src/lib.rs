@@ -20,6 +20,7 @@ pub mod needle;
 pub mod organ;
 pub mod path;
 pub mod plan;
+pub mod recording;
 pub mod registry;
 pub mod resolve;
 pub mod scene;
