@@ -133,6 +133,20 @@ fn the_scenes_of_the_project_find_their_tissue_on_made_and_real_patients() {
 fn a_scene_is_tried_out_and_each_stage_of_its_plan_has_a_cost() {
     let text = "name = \"small\"\n[volume]\nsize = 64\n[tool.approach]\nfrom = [0.5, 0.0, 0.5]\ntoward = [0.5, 0.5, 0.5]\npress_mm = 6.0\nperiod_s = 1.0\n\
                 [rendering]\nsize = [96, 72]\nsection_size = [64, 48]\n[deformation]\nrelaxation_s = 0.2\n[effects]\ndeformation = true\nrelaxation = true\nsections = true\n";
+    // tissue that goes with a needle: other stages in the place of some
+    let dragged = "name = \"dragged\"\n[volume]\nphantom = \"torso\"\nsize = 64\n[tool]\nkind = \"needle\"\n[tool.approach]\nfrom = [0.55, 0.0, 0.2]\n\
+                   toward = [0.55, 0.6, 0.2]\npress_mm = 30.0\nperiod_s = 2.0\n[rendering]\nsize = [96, 72]\n[effects]\ndeformation = true\nneedle = true\nneedle-drag = true\n";
+    let dragged = File::new("dragged", dragged);
+    let dragged = told(&[dragged.path()]);
+    for (l, process) in dragged["measured"]["loops"].as_array().unwrap().iter().zip(dragged["processes"].as_array().unwrap()) {
+        let timed = names(&l["stages"]);
+        assert!(!timed.is_empty() && timed.iter().all(|name| names(&process["stages"]).contains(name)), "{timed:?} of {process}");
+        // what a loop waits is nobody's
+        let (mean, p99) = (l["mean_us"].as_f64().unwrap(), l["p99_us"].as_f64().unwrap());
+        assert!(mean <= 1.5 * p99, "stages take {mean} µs of turns of {p99} µs: {l}");
+    }
+    assert!(names(&dragged["measured"]["loops"][0]["stages"]).contains(&"needle-drag"), "{dragged}");
+    assert!(!names(&dragged["processes"][1]["stages"]).contains(&"contact"), "a needle is not felt by contact");
     let scene = File::new("tried", text);
     let told = told(&[scene.path()]);
     assert!(told["measured"]["seconds"].as_f64().is_some_and(|s| (2.0..8.0).contains(&s)), "{}", told["measured"]);

@@ -25,7 +25,10 @@ use rustix::process::Signal;
 use serde_json::Value;
 use std::{
     process::{Child, Command, Stdio},
-    sync::atomic::{AtomicBool, Ordering::Relaxed},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering::Relaxed},
+    },
     time::{Duration, Instant},
 };
 use support::{Run, Scratch, eventually, left_over, report, signal};
@@ -109,12 +112,16 @@ struct Seen {
     back: Duration,
 }
 
+/// Runs one after the other: one's programs are not the other's load.
+static ALONE: Mutex<()> = Mutex::new(());
+
 fn run(scratch: &Scratch, text: &str, programs: usize, seconds: f64) -> Seen {
     let (scene, out) = (scratch.write("scene.toml", text), scratch.file("run.json"));
     let mut run = Run::start(Command::new(env!("CARGO_BIN_EXE_maille")).arg("run").arg(scene).arg("--headless").arg("--report").arg(&out));
     let domain = Domain::named(&run.domain()).expect("the run's domain");
     let control = ControlMap::open(&domain).expect("its control block");
-    for role in [Role::Haptic, Role::Deformation, Role::Rendering] {
+    let deforms = text.contains("deformation = true");
+    for role in [Role::Haptic, Role::Deformation, Role::Rendering].into_iter().filter(|r| deforms || *r != Role::Deformation) {
         eventually("a service is ready", || control.service(role).state() == ServiceState::Ready);
     }
     let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
@@ -170,8 +177,66 @@ fn of_rendering(list: &Value) -> Vec<(String, f64)> {
     list.as_array().unwrap().iter().map(pair).filter(|(name, _)| !name.starts_with("deformation")).collect()
 }
 
+/// Turn by turn, a place on the ladder of rendering: one rung down, or back up by that one, and all the way back at the end.
+fn assert_in_order(governor: &Value) {
+    let ladder = of_rendering(&governor["ladder"]);
+    let mut place = 0;
+    for t in governor["turns"].as_array().unwrap().iter().filter(|t| t["of"] == "rendering") {
+        let turned = (t["knob"].as_str().unwrap().to_owned(), t["value"].as_f64().unwrap());
+        if t["coarser"] == true {
+            assert_eq!(turned, ladder[place], "not the next rung of {ladder:?}");
+            place += 1;
+        } else {
+            place -= 1;
+            assert_eq!(turned.0, ladder[place].0, "not the last that was given up");
+        }
+    }
+    assert_eq!((place, &governor["given_up"]), (0, &serde_json::json!([])));
+}
+
+/// A made torso that breathes, pressed all the while; pictures that the machine can draw about half as often as the scene wants them at least.
+#[test]
+fn in_a_breathing_scene_the_warp_s_tolerance_gives_way_in_its_place_and_comes_back_and_the_hand_feels_no_step() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let text = |accuracy: &str, rendering: &str| {
+        let head = scene(accuracy, rendering);
+        head.replace("phantom = \"head\"\nsize = 96", "phantom = \"torso\"\nsize = 96\n[breathing]\nperiod_s = 3.0")
+            .replace("from = [0.5, 0.0, 0.5]\ntoward = [0.5, 0.5, 0.5]", "from = [0.55, 0.0, 0.2]\ntoward = [0.55, 0.6, 0.2]")
+            .replace("deformation = true\nrelaxation = true\n", "breathing = true\n")
+    };
+    let scratch = Scratch::new("governor-breathing");
+    let plain = run(&scratch, &text("balanced", &format!("rate_hz = {RATE_HZ}\n")), 0, 2.0);
+    let frame_ms = plain.report["services"]["rendering"]["frame_ms"]["p50"].as_f64().unwrap();
+    let floor_hz = (1e3 * PLANNED * LOAD / frame_ms).clamp(1.0, RATE_HZ);
+    let seen = run(&scratch, &text("auto", &format!("rate_hz = {RATE_HZ}\nfloor_hz = {floor_hz:.3}\n")), 4, 5.0);
+    let governor = &seen.report["governor"];
+    println!(
+        "a frame takes {frame_ms:.1} ms, floor {floor_hz:.1} Hz; beside 4 programs: at most {} rungs given up, all back {:.1} s after; force at most {:.4} N a tick, {:.4} without them",
+        seen.most_given_up,
+        seen.back.as_secs_f64(),
+        seen.largest_step_n,
+        plain.largest_step_n
+    );
+    for t in governor["turns"].as_array().unwrap() {
+        println!("  {t}");
+    }
+    let ladder = of_rendering(&governor["ladder"]);
+    let first = |name: &str| ladder.iter().position(|(knob, _)| knob == name).unwrap_or_else(|| panic!("{name} is no rung of {ladder:?}"));
+    let [step, tolerance, scale] = ["rendering.step", "breathing.picture_tolerance_mm", "rendering.scale"].map(first);
+    assert!(step < tolerance && tolerance < scale, "in the declared order: {ladder:?}");
+    assert!(ladder.iter().all(|(knob, _)| !knob.starts_with("deformation")), "nothing gives way: {ladder:?}");
+    assert!(seen.most_given_up > 0, "four programs press two cores: {governor:#}");
+    assert_in_order(governor);
+    assert!(seen.largest_step_n <= (1.5 * plain.largest_step_n).clamp(0.05, STEP_N), "{} N in one tick", seen.largest_step_n);
+    // however little was given up, nothing was shown further from its place than the coarsest rung allows
+    let coarsest = ladder.iter().filter(|(knob, _)| knob == "breathing.picture_tolerance_mm").map(|(_, mm)| *mm).fold(0.1, f64::max);
+    let shown_mm = seen.report["services"]["rendering"]["warp"]["error_mm"]["max"].as_f64().unwrap();
+    assert!(shown_mm <= coarsest, "{shown_mm} mm, and {coarsest} mm is the coarsest that the ladder has");
+}
+
 #[test]
 fn under_load_knobs_give_way_in_order_and_come_back_and_the_hand_feels_no_step() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let asked = std::env::var("MAILLE_LOAD_SECONDS").ok().map(|s| s.parse::<f64>().expect("MAILLE_LOAD_SECONDS is a number of seconds"));
     let (seconds, programs) = asked.map_or((5.0, 4), |s| (s, 1));
     let scratch = Scratch::new("governor");
@@ -202,19 +267,7 @@ fn under_load_knobs_give_way_in_order_and_come_back_and_the_hand_feels_no_step()
     // the slew limit would hold 0.1 N whatever happened: no step is no more than the hand's own, give or take a late tick
     let own_n = plain.largest_step_n;
     assert!(seen.largest_step_n <= (1.5 * own_n).clamp(0.05, STEP_N), "{} N in one tick, {own_n} without load", seen.largest_step_n);
-    // turn by turn, a place on the ladder of rendering: one rung down, or back up by that one
-    let mut place = 0;
-    for t in turns.iter().filter(|t| t["of"] == "rendering") {
-        let turned = (t["knob"].as_str().unwrap().to_owned(), t["value"].as_f64().unwrap());
-        if t["coarser"] == true {
-            assert_eq!(turned, ladder[place], "not the next rung of {ladder:?}");
-            place += 1;
-        } else {
-            place -= 1;
-            assert_eq!(turned.0, ladder[place].0, "not the last that was given up");
-        }
-    }
-    assert_eq!((place, &governor["given_up"]), (0, &serde_json::json!([])));
+    assert_in_order(governor);
     if asked.is_none() {
         assert!(seen.most_given_up > 0, "four programs press two cores: {governor:#}");
     } else {

@@ -20,9 +20,9 @@ use std::{
 use support::{PATIENCE, Run, SMALL_SCENE, Scratch, eventually, left_over, signal};
 use tungstenite::{Message, WebSocket};
 
-/// Bytes of a frame of the small scene: the 3D view, and three sections.
+/// Bytes of a frame of the small scene with larger sections: the 3D view, and three of these.
 const VIEW: u64 = 96 * 72 * 3;
-const SECTIONS: u64 = 3 * 64 * 48 * 3;
+const SECTIONS: u64 = 3 * 640 * 480 * 3;
 
 /// A page without a browser.
 struct Page(WebSocket<TcpStream>);
@@ -57,10 +57,25 @@ fn frame_bytes(control: &ControlMap) -> u64 {
     (now.1 - before.1) / (now.0 - before.0).max(1)
 }
 
+/// Private dirty memory of a process.
+fn private_bytes(pid: u32) -> u64 {
+    let rollup = std::fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).expect("it lives");
+    let line = rollup.lines().find_map(|line| line.strip_prefix("Private_Dirty:")).expect("the kernel tells");
+    1024 * line.trim().trim_end_matches("kB").trim().parse::<u64>().expect("a number")
+}
+
+/// Bytes of a run's segments, messages and frames in /dev/shm that are really taken.
+fn shared_bytes(domain: &Domain) -> u64 {
+    use std::os::unix::fs::MetadataExt as _;
+    let files = std::fs::read_dir("/dev/shm").expect("shared memory").flatten();
+    let own = files.filter(|f| f.file_name().to_string_lossy().contains(domain.name()) && f.path().is_file());
+    own.filter_map(|f| f.metadata().ok()).map(|m| m.blocks() * 512).sum()
+}
+
 #[test]
 fn sections_go_from_the_page_with_their_memory_and_come_back() {
     let scratch = Scratch::new("live");
-    let scene = scratch.write("small.toml", SMALL_SCENE);
+    let scene = scratch.write("small.toml", &SMALL_SCENE.replace("[64, 48]", "[640, 480]"));
     let mut run = Run::start(Command::new(env!("CARGO_BIN_EXE_maille")).arg("run").arg(scene));
     let domain = Domain::named(&run.domain()).expect("the run's domain");
     let control = ControlMap::open(&domain).expect("its control block");
@@ -70,13 +85,38 @@ fn sections_go_from_the_page_with_their_memory_and_come_back() {
     let mut page = Page(socket);
     page.told("what may be switched", |state| (state["effects"] == json!([["sections", true]])).then_some(()));
     eventually("all views are drawn", || frame_bytes(&control) == VIEW + SECTIONS);
+    let with_sections = shared_bytes(&domain);
+    let on = private_bytes(run.service(Role::Rendering, 1));
 
     page.say(&json!({ "type": "effect", "name": "sections", "on": false }));
     page.told("that they are off", |state| (state["effects"] == json!([["sections", false]])).then_some(()));
     eventually("they are gone", || frame_bytes(&control) == VIEW);
     let pid = run.service(Role::Rendering, 1);
     assert_eq!(control.service(Role::Rendering).restarts.load(std::sync::atomic::Ordering::Relaxed), 0, "the same process {pid} goes on");
+    // the pool of frames is for several: at least the one that is drawn, one that waits and one that is read
+    eventually("their shared memory is given back", || with_sections - shared_bytes(&domain) >= 3 * SECTIONS);
+    let console = run.service(Role::Console, 1);
+    for pid in [pid, console] {
+        let holds = || std::fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default();
+        eventually("nobody maps what is gone", || !holds().lines().any(|line| line.contains(domain.name()) && line.ends_with("(deleted)")));
+    }
+    println!("shared memory of the run with sections {with_sections}, without {} bytes", shared_bytes(&domain));
 
+    let off = private_bytes(pid);
+    // pictures, at the least; what rays write beside them is more
+    assert!(on >= off + SECTIONS, "{on} bytes of its own with sections, {off} without");
+
+    // and the same the next times: nothing piles up
+    for round in 0..3 {
+        page.say(&json!({ "type": "effect", "name": "sections", "on": true }));
+        eventually("they are back", || frame_bytes(&control) == VIEW + SECTIONS);
+        eventually("with the memory that they had", || shared_bytes(&domain) == with_sections);
+        page.say(&json!({ "type": "effect", "name": "sections", "on": false }));
+        eventually("they are gone again", || frame_bytes(&control) == VIEW);
+        // a page of the heap here or there, and one frame's pool that is put away only with the next frame
+        eventually("their own memory is given back", || private_bytes(pid) <= off + SECTIONS / 4);
+        println!("round {round}: {} bytes of its own, at first {on} with sections and {off} without", private_bytes(pid));
+    }
     page.say(&json!({ "type": "effect", "name": "sections", "on": true }));
     eventually("they are back", || frame_bytes(&control) == VIEW + SECTIONS);
 

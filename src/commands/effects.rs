@@ -2,7 +2,7 @@
 
 use super::{
     Failure, Outcome,
-    tradeoff::{failure, write_all},
+    tradeoff::{failure, make, write_all},
 };
 use maille_tradeoff::effects::{EffectsOptions, effects};
 use std::{io::Write as _, path::PathBuf, time::Duration};
@@ -52,6 +52,7 @@ pub fn run(args: &Args) -> Outcome {
         rounds: usize::from(args.rounds),
         only: args.only.clone(),
     };
+    make(args.output.as_deref())?;
     let report = effects(&options, |what| eprintln!("maille: {what}")).map_err(failure)?;
     if let Some(folder) = &args.output {
         write_all(

@@ -19,6 +19,7 @@ use std::{
     os::unix::process::CommandExt as _,
     path::PathBuf,
     process::{Command, Stdio},
+    sync::atomic::Ordering::Relaxed,
     time::{Duration, Instant},
 };
 
@@ -55,6 +56,8 @@ pub struct LoopCost {
     pub p50_us: f64,
     /// 99th percentile [µs]
     pub p99_us: f64,
+    /// mean of what its stages take together, where they were timed [µs]
+    pub mean_us: f64,
     /// its period [µs]
     pub period_us: f64,
     /// turns a second that were seen; for a loop that turns only when there is something to do, those that its median turn would allow, at most the rate
@@ -116,6 +119,7 @@ impl Drop for Scratch {
 
 /// A run by this program; its report.
 fn run(scene: &Scene, seconds: f64) -> Result<Value, String> {
+    let interrupted = maille_tradeoff::interruption().map_err(|e| e.to_string())?;
     let scratch = Scratch(std::env::temp_dir().join(format!("maille-check-{}", std::process::id())));
     let failed = |what: &str, e: &dyn std::fmt::Display| format!("the scene could not be tried out: {what}: {e}");
     fs::create_dir_all(&scratch.0).map_err(|e| failed("no folder for it", &e))?;
@@ -123,12 +127,15 @@ fn run(scene: &Scene, seconds: f64) -> Result<Value, String> {
     fs::write(&file, scene.to_toml()).map_err(|e| failed("its file", &e))?;
     let log = fs::File::create(&said).map_err(|e| failed("its log", &e))?;
     let and = log.try_clone().map_err(|e| failed("its log", &e))?;
+    // what the scene would record is not touched
+    let record = scene.recording_file().map_or(Vec::new(), |_| vec!["--record".into(), scratch.0.join("record.csv")]);
     let mut child = Command::new("/proc/self/exe")
         .arg0("maille")
         .arg("run")
         .arg(&file)
         .args(["--headless", "--stages", "--duration", &format!("{}ms", (seconds * 1e3).round()), "--report"])
         .arg(&report)
+        .args(record)
         .stdin(Stdio::null())
         .stdout(log)
         .stderr(and)
@@ -138,8 +145,13 @@ fn run(scene: &Scene, seconds: f64) -> Result<Value, String> {
     let status = loop {
         match child.try_wait().map_err(|e| failed("the run cannot be waited for", &e))? {
             Some(status) => break status,
+            None if interrupted.load(Relaxed) => {
+                // not reaped yet, so the id is still this child's; it ends as a run does, and leaves nothing
+                let _ = rustix::process::kill_process(rustix::process::Pid::from_child(&child), rustix::process::Signal::TERM);
+                let _ = child.wait();
+                return Err("interrupted".into());
+            }
             None if Instant::now() > deadline => {
-                // Ctrl-C on the terminal reaches it too, so it ends as a run does
                 let _ = child.kill();
                 let _ = child.wait();
                 return Err(failed("the run did not end", &format!("{PATIENCE_S:.0} s too long")));
@@ -169,19 +181,22 @@ fn cost(report: &Value, plan: &Plan, process: Process, asked_hz: f64) -> Option<
     };
     let (p50_us, p99_us) = (us * n(&format!("{key}/p50")), us * n(&format!("{key}/p99")));
     let period_us = 1e6 / asked_hz;
+    let timed = || own["stages"].as_array().into_iter().flatten();
+    let count = timed().filter_map(|s| s["count"].as_f64()).fold(0.0, f64::max);
+    let mean_us = timed().filter_map(|s| Some(s["us"].as_f64()? * s["count"].as_f64()?)).sum::<f64>() / count.max(1.0);
     let (rate_hz, holds) = match process {
         Process::Haptic => (n("/rate_hz"), n("/overruns") <= MISSED * (n("/ticks") + n("/overruns"))),
-        _ => (asked_hz.min(if p50_us > 0.0 { 1e6 / p50_us } else { asked_hz }), p50_us <= period_us),
+        // a queue that grows by some long turns does not hold, however short the others
+        _ => (asked_hz.min(if p50_us > 0.0 { 1e6 / p50_us } else { asked_hz }), p50_us.max(mean_us) <= period_us),
     };
     let owner =
         |stage: &str| plan.effects.iter().find(|e| e.stages.iter().any(|s| s.process == process && s.name == stage)).map_or("", |e| e.name);
-    let stages = own["stages"].as_array().into_iter().flatten();
-    let stages = stages.filter_map(|s| {
+    let stages = timed().filter_map(|s| {
         let name = s["name"].as_str()?;
         Some(StageCost { name: name.to_owned(), effect: owner(name), us: s["us"].as_f64()? })
     });
     let coarse_share = n("/coarse_frames") / n("/frames").max(1.0);
-    Some(LoopCost { process, turn, p50_us, p99_us, period_us, rate_hz, holds, coarse_share, stages: stages.collect() })
+    Some(LoopCost { process, turn, p50_us, p99_us, mean_us, period_us, rate_hz, holds, coarse_share, stages: stages.collect() })
 }
 
 /// What to do about a loop that does not hold its rate, or only by drawing less.
@@ -190,11 +205,14 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
     let service = l.process.service();
     let trouble = match l.process {
         _ if l.p50_us == 0.0 => return None,
+        // nothing moves there by itself: a picture that stands was drawn again and again only to be timed
+        Process::Rendering if plan.processes.len() == 1 && !scene.has_effect("breathing") => return None,
         Process::Haptic if !l.holds => format!("haptic will miss ticks: {:.1} of {rate:.0} a second were made", l.rate_hz),
         _ if !l.holds => format!(
-            "{service} will not hold its {rate:.0} Hz: a {} takes {}, and there are {}",
+            "{service} will not hold its {rate:.0} Hz: a {} takes {}{}, and there are {}",
             l.turn.name(),
             time(l.p50_us),
+            if l.mean_us > l.period_us { format!(", in the mean {}", time(l.mean_us)) } else { String::new() },
             time(l.period_us)
         ),
         Process::Rendering if l.coarse_share > OFTEN => {
@@ -214,7 +232,7 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
             // the front is of the stage that the knob turns, and that is a part of the loop's turn
             let (_, stage) = knob.stage.filter(|(process, _)| *process == eased)?;
             // frames that are drawn coarsely already gain nothing by it
-            if stage == "ray casting" && l.coarse_share > OFTEN {
+            if stage == "ray casting" && l.coarse_share > OFTEN && l.holds {
                 return None;
             }
             let points: Vec<FrontPoint> = fronts.of(knob.name)?;
@@ -235,7 +253,11 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
         .collect();
     stages.sort_by(|a, b| b.us.total_cmp(&a.us));
     let mut ways: Vec<String> = knobs.into_iter().take(2).map(|(_, text)| format!("turn {text}")).collect();
-    ways.extend(stages.first().map(|s| format!("switch off `{}` ({} a {})", s.effect, time(s.us), l.turn.name())));
+    ways.extend(stages.first().map(|s| {
+        // what needs it goes with it
+        let others = plan.effects.iter().filter(|e| e.depends_on.contains(&s.effect)).map(|e| format!(" and `{}`", e.name));
+        format!("switch off `{}`{} ({} a {})", s.effect, others.collect::<String>(), time(s.us), l.turn.name())
+    }));
     ways.push(match l.process {
         Process::Haptic => "leave a core to it".to_owned(),
         _ => format!("ask for less than {rate:.0} Hz (`{service}.rate_hz`)"),
@@ -276,8 +298,13 @@ impl Costs {
                 stages.join(", ")
             ));
         }
+        let late: Vec<&str> = self.loops.iter().filter(|l| l.holds && l.headroom() < 0.0).map(|l| l.process.service()).collect();
         match self.advice.is_empty() {
-            true => out.push("  all loops hold their rates here".into()),
+            true if late.is_empty() => out.push("  all loops hold their rates here".into()),
+            true => out.push(format!(
+                "  all loops hold their rates here, but some turns of {} come late (p99 is beyond the period)",
+                late.join(" and ")
+            )),
             false => out.extend(self.advice.iter().map(|a| format!("  {a}"))),
         }
         out
@@ -288,7 +315,7 @@ impl Costs {
         let stage = |s: &StageCost| json!({ "name": s.name, "effect": s.effect, "us": s.us });
         let one = |l: &LoopCost| {
             json!({ "service": l.process.service(), "turn": l.turn.name(), "p50_us": l.p50_us, "p99_us": l.p99_us, "period_us": l.period_us,
-                    "headroom": l.headroom(), "rate_hz": l.rate_hz, "holds": l.holds, "coarse_share": l.coarse_share,
+                    "mean_us": l.mean_us, "headroom": l.headroom(), "rate_hz": l.rate_hz, "holds": l.holds, "coarse_share": l.coarse_share,
                     "stages": l.stages.iter().map(stage).collect::<Vec<_>>() })
         };
         json!({ "seconds": self.seconds, "load_1m": self.load_1m, "loops": self.loops.iter().map(one).collect::<Vec<_>>(), "advice": self.advice })

@@ -29,7 +29,10 @@ pub struct Args {
     /// Write the run's numbers as JSON when it ends
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// What moves the tool: path, path:FILE (way points), sim (a simulated hand), console (the page), external (another
+    /// Record the tool's way and the forces: lines of comma-separated values, which --device path:FILE.csv plays again
+    #[arg(long, value_name = "FILE.csv")]
+    record: Option<PathBuf>,
+    /// What moves the tool: path, path:FILE (way points, or a recording), sim (a simulated hand), console (the page), external (another
     /// program), inverse3, touch, forcedimension
     #[arg(long, value_name = "DEVICE", value_parser = device)]
     device: Option<Device>,
@@ -53,6 +56,7 @@ pub fn run(args: &Args) -> Outcome {
         headless: args.headless,
         duration: args.duration,
         report: args.report.clone(),
+        record: args.record.clone(),
         device: args.device.clone(),
         by_hand: args.by_hand.clone(),
         fronts: args.fronts.clone(),

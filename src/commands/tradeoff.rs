@@ -2,7 +2,10 @@
 
 use super::{Failure, Outcome};
 use maille_tradeoff::{Effort, Options, TradeoffError, curves, tradeoff};
-use std::{fs, io::Write as _, path::PathBuf};
+use std::{fs, io::Write as _, path::PathBuf, time::Duration};
+
+/// `--quick` is done after this time; writing takes less than what is missing to a minute.
+const QUICK: Duration = Duration::from_secs(57);
 
 /// Measure what each knob's accuracy costs in time: error against a truth, time, the Pareto front
 ///
@@ -48,9 +51,11 @@ pub fn run(args: &Args) -> Outcome {
     let options = Options {
         only: args.only.clone(),
         effort: if args.full { Effort::Full } else { Effort::Quick },
+        within: (!args.full).then_some(QUICK),
         volume: args.volume.clone(),
         data: std::env::var_os("MAILLE_DATA").map(PathBuf::from),
     };
+    make(args.output.as_deref())?;
     let report = tradeoff(&options, |curve| eprintln!("maille: {}", curve.name)).map_err(failure)?;
     if let Some(folder) = &args.output {
         write_all(
@@ -75,6 +80,12 @@ pub(super) fn failure(error: TradeoffError) -> Failure {
         TradeoffError::Unknown { .. } => Failure::Usage(error.to_string()),
         other => Failure::Refused(other.to_string()),
     }
+}
+
+/// The folder for what will be measured, made before: one that cannot be made is told at the start.
+pub(super) fn make(folder: Option<&std::path::Path>) -> Outcome {
+    let Some(folder) = folder else { return Ok(()) };
+    fs::create_dir_all(folder).map_err(|e| Failure::Refused(format!("{} cannot be written: {e}", folder.display())))
 }
 
 /// Writes files into a folder, which is made.

@@ -5,7 +5,7 @@
 
 use crate::protocol::{FRAME_HEADER_BYTES, FRAME_MAGIC};
 use jpeg_encoder::{ColorType, Encoder};
-use maille_contract::FrameHeader;
+use maille_contract::{FrameHeader, messages::VIEWS};
 use std::sync::Arc;
 
 /// A frame ready to be sent.
@@ -21,7 +21,7 @@ pub struct Picture {
 pub struct PictureEncoder {
     quality: u8,
     number: u32,
-    views: [EncodedView; 5],
+    views: [EncodedView; VIEWS.len()],
 }
 
 #[derive(Default)]
@@ -91,7 +91,7 @@ mod tests {
 
     fn frame() -> (FrameHeader, Vec<u8>) {
         let rect = |offset, width, height| ViewRect { offset, width, height };
-        let views = [rect(0, 32, 24), rect(2304, 16, 8), rect(2688, 16, 8), rect(0, 0, 0), rect(0, 0, 0)];
+        let views = [rect(0, 32, 24), rect(2304, 16, 8), rect(2688, 16, 8), rect(0, 0, 0), rect(0, 0, 0), rect(0, 0, 0)];
         let stamp = Stamp { time_ns: 2_500_000_000, sequence: 7, incarnation: 1 };
         (
             FrameHeader { stamp, epoch: 5, view_sequence: 3, render_ns: 4_000_000, shown_ns: 0, views },
@@ -104,14 +104,14 @@ mod tests {
         let (header, payload) = frame();
         let picture = PictureEncoder::new(85).encode(&header, &payload).unwrap();
         let m = &picture.message;
-        assert_eq!(&m[..4], b"MLF2");
+        assert_eq!(&m[..4], b"MLF3");
         assert_eq!(u32::from_le_bytes(m[4..8].try_into().unwrap()), picture.number);
         assert_eq!(f64::from_le_bytes(m[8..16].try_into().unwrap()), 2.5);
         assert_eq!(f64::from_le_bytes(m[16..24].try_into().unwrap()), 5.0);
         assert_eq!(f64::from_le_bytes(m[24..32].try_into().unwrap()), 3.0);
         assert_eq!(f32::from_le_bytes(m[32..36].try_into().unwrap()), 4.0);
         let mut at = FRAME_HEADER_BYTES;
-        for v in 0..5 {
+        for v in 0..VIEWS.len() {
             let row = &m[40 + 8 * v..48 + 8 * v];
             let len = u32::from_le_bytes(row[4..].try_into().unwrap()) as usize;
             assert_eq!(u16::from_le_bytes(row[..2].try_into().unwrap()) as u32, header.views[v].width);

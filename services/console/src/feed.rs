@@ -31,6 +31,8 @@ pub struct Facts {
     pub transfer: String,
     /// its points, HU r g b opacity over 1 mm; empty where they are not known here
     pub transfer_points: Vec<[f64; 5]>,
+    /// panels of the effects that the scene calls for, as the registry names them
+    pub panels: Vec<&'static str>,
     /// whether the scene has a tool
     pub has_tool: bool,
     /// whether the scene's tool takes tissue away, so that there is something to take back

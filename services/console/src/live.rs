@@ -17,7 +17,7 @@ use maille_contract::{
 use maille_raycast::{Preset, Transfer};
 use maille_scene::{
     Accuracy, BoxMm, CameraKind, Mode, Scene,
-    registry::{LIVE_KNOBS, effects, place},
+    registry::{CalledBy, LIVE_KNOBS, effects, place},
 };
 use maille_transport::{Domain, FrameSubscriber, Life, Node, Publisher, Subscriber, monotonic_ns};
 use std::sync::atomic::Ordering::Relaxed;
@@ -88,6 +88,12 @@ impl Live {
             endoscope_fov_deg: scene.rendering.endoscope_fov_deg,
             transfer: scene.rendering.transfer.clone(),
             transfer_points: transfer(&scene.rendering.transfer).map(|t| presets::points(&t)).unwrap_or_default(),
+            // those of the plan, which has none where the console was not asked for and came by hand
+            panels: effects()
+                .filter(|e| e.called_by == CalledBy::Always || scene.has_effect(e.name))
+                .flat_map(|e| e.panels)
+                .copied()
+                .collect(),
             has_tool: scene.tool.is_some(),
             incises: scene.has_effect("incision"),
             breathing: signal.is_some().then(|| scene.breathing.signal.clone().into()),

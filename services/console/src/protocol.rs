@@ -23,22 +23,25 @@
 //! | 16 | f64 | epoch of the tissue shown |
 //! | 24 | f64 | sequence of the view state shown |
 //! | 32 | f32 | time spent rendering \[ms\] |
-//! | 36 | u32 | number of views, 5 |
+//! | 36 | u32 | number of views, 6 |
 //! | 40 + 8 v | u16, u16, u32 | width, height, bytes of view v's JPEG; 0 bytes where the scene has no such view |
-//! | 80 … | | the JPEGs, one after the other, in the order 3d, axial, coronal, sagittal, ultrasound |
+//! | 88 … | | the JPEGs, one after the other, in the order 3d, axial, coronal, sagittal, ultrasound, x-ray |
 //!
 //! Lengths are millimetres in patient coordinates (LPS), forces newtons, values HU. A message that is not understood, or
 //! whose numbers cannot be used, changes nothing and is counted.
 
-use maille_contract::{ViewState, messages::TRANSFER_POINTS};
+use maille_contract::{
+    ViewState,
+    messages::{TRANSFER_POINTS, VIEWS},
+};
 use serde::{Deserialize, Serialize};
 
 /// Raised when a message changes its meaning.
-pub const PROTOCOL: u32 = 2;
-/// First four bytes of a frame: "MLF2".
-pub const FRAME_MAGIC: u32 = u32::from_le_bytes(*b"MLF2");
+pub const PROTOCOL: u32 = 3;
+/// First four bytes of a frame: "MLF3".
+pub const FRAME_MAGIC: u32 = u32::from_le_bytes(*b"MLF3");
 /// Bytes before the first JPEG.
-pub const FRAME_HEADER_BYTES: usize = 80;
+pub const FRAME_HEADER_BYTES: usize = 40 + 8 * VIEWS.len();
 /// Longest message that a page may send: the largest real one is a tenth of it.
 pub const MAX_REQUEST_BYTES: usize = 16 << 10;
 

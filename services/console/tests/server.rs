@@ -112,7 +112,7 @@ impl Page {
 
 /// The four JPEGs of a frame.
 fn jpegs(frame: &[u8]) -> Vec<&[u8]> {
-    let mut at = 80;
+    let mut at = 88;
     let cut = |v: usize| {
         let bytes = u32::from_le_bytes(frame[44 + 8 * v..48 + 8 * v].try_into().unwrap()) as usize;
         at += bytes;
@@ -126,7 +126,7 @@ fn a_page_is_greeted_and_gets_four_pictures_and_a_state() {
     let console = Console::start();
     let mut page = console.connect();
     let hello = page.text();
-    assert_eq!((hello["type"].as_str(), hello["protocol"].as_u64()), (Some("hello"), Some(2)));
+    assert_eq!((hello["type"].as_str(), hello["protocol"].as_u64()), (Some("hello"), Some(3)));
     assert_eq!(hello["facts"]["low_mm"][0], -90.0);
     assert!(hello["presets"].as_array().unwrap().len() >= 4);
     let frame = page.frame();

@@ -88,9 +88,11 @@ fn pins(grid: &Grid, drag: &NeedleDrag) -> Vec<Pin> {
 impl<W: Stopwatch> Engine<W> {
     /// Tissue as these pins have it, from rest; `None` when nothing has moved.
     fn drag(&mut self, pins: &[Pin], now_ns: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
+        self.watch.start();
         let mut region = self.mail.relax(0.0, 0.0);
         let pushed = self.mail.push(&reader.rest(), pins);
         region.merge(&pushed.region);
+        self.watch.split("needle-drag");
         if region.is_empty() {
             return None;
         }

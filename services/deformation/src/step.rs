@@ -209,6 +209,7 @@ impl<W: Stopwatch> Engine<W> {
         if !self.object_shape {
             return None;
         }
+        self.watch.start();
         let region = self.mail.set_threshold(&reader.rest(), Some(threshold_hu));
         (!region.is_empty()).then(|| self.commit(&region, reader, writer))
     }
@@ -280,7 +281,9 @@ impl<W: Stopwatch> Engine<W> {
     pub fn undo(&mut self, undos: u64, reader: &Reader, writer: &mut Writer) -> Option<Done> {
         let incisions = self.incisions.as_mut().filter(|_| self.state.strokes.undone < undos)?;
         self.state.strokes.undone += 1;
+        self.watch.start();
         let changed = incisions.undo(&reader.rest(), &mut self.mail, &mut self.state.strokes).unwrap_or_default();
+        self.watch.split("incision");
         Some(self.commit_incision(&changed, reader, writer))
     }
 

@@ -1,14 +1,16 @@
 //! The engine's steps one by one, without its queue and its pauses: for measuring what a step takes.
 
-use crate::{DeformationError, octree, restore, step::Engine};
+use crate::{DeformationError, RELAX_NS, drag::Drag, octree, restore, step::Engine};
 use maille_contract::{Role, Switches, ToolMove};
 use maille_scene::Scene;
 use maille_store::{Reader, Writer};
-use maille_transport::{Domain, Untimed, monotonic_ns};
+use maille_transport::{ControlMap, Domain, Untimed, monotonic_ns};
 
 /// An engine that steps when it is told to.
 pub struct Turns {
     engine: Engine<Untimed>,
+    drag: Option<Drag>,
+    control: ControlMap,
     writer: Writer,
     reader: Reader,
 }
@@ -23,7 +25,7 @@ impl Turns {
         let mut engine = Engine::new(scene, reader.info(), Untimed);
         engine.octree = octree::Leaves::open(domain, scene, &writer)?;
         restore::restore(&mut engine, &writer);
-        Ok(Self { engine, writer, reader })
+        Ok(Self { engine, drag: Drag::new(scene), control: ControlMap::open(domain)?, writer, reader })
     }
 
     /// Answers a tool move; elements that it moved.
@@ -31,6 +33,18 @@ impl Turns {
         self.engine
             .step(std::slice::from_ref(message), monotonic_ns(), &self.reader, &mut self.writer)
             .map_or(0, |done| done.moved_elements)
+    }
+
+    /// One turn as the process's own, at `now_ns`: whatever the tool asks for, by blade, needle or moves, or, where nothing waits, relaxation (towards
+    /// rest also in the middle of a press: a turn has no pauses). False where there was nothing to do.
+    pub fn turn(&mut self, moves: &[ToolMove], now_ns: u64) -> bool {
+        let Self { engine, drag, control, writer, reader } = self;
+        let tool = control.held_tool(now_ns);
+        let cut = engine.cuts() && engine.cut(tool.as_ref(), reader, writer).is_some();
+        let dragged = drag.as_mut().is_some_and(|drag| drag.follow(engine, control, now_ns, reader, writer).is_some());
+        let stepped = !engine.cuts() && !moves.is_empty() && engine.step(moves, now_ns, reader, writer).is_some();
+        let relaxed = !stepped && engine.relaxes() && engine.relax(now_ns, 2 * RELAX_NS, &[], &|| false, reader, writer).is_some();
+        cut || dragged || stepped || relaxed
     }
 
     /// Switches what may be switched.

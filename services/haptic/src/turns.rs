@@ -43,6 +43,11 @@ impl<'a> Turns<'a> {
         self.tick.run(&self.life, self.now_ns, false)
     }
 
+    /// When the last tick was, in its own time [ns].
+    pub fn now_ns(&self) -> u64 {
+        self.now_ns
+    }
+
     /// The tool move that the ticks since the last call handed over, if there was one.
     pub fn tool_move(&mut self) -> Option<ToolMove> {
         let (message, generation) = self.outbox.moves.load::<ToolMove>().filter(|(_, generation)| *generation != self.seen_move)?;

@@ -1,16 +1,20 @@
 //! A frame: the views drawn, then laid side by side in one sample.
 
 use crate::{backend::Backend, meshes::Meshes, overlay, view::View};
-use maille_contract::{FrameHeader, Switches, ToolState, messages::ViewRect};
+use maille_contract::{
+    FrameHeader, Switches, ToolState,
+    messages::{VIEWS, ViewRect},
+};
 use maille_raycast::{
-    Capsule, Extras, Geometry, Labels, Overlay, Picture, Plane, Quality, RenderError, Section, Skip, Step, Ultrasound, Warp, ultrasound,
+    Camera, Capsule, Extras, Geometry, Labels, Overlay, Picture, Plane, Quality, RenderError, Section, Settings, Skip, Step, Ultrasound,
+    Warp, ultrasound,
 };
 use maille_scene::{Scene, registry};
 use maille_transport::{Stopwatch, monotonic_ns};
 use maille_volume::BrickSource;
 use rayon::prelude::*;
 
-/// Planes of views 1 to 3, in the order of [`maille_contract::messages::VIEWS`].
+/// Planes of views 1 to 3, in the order of [`VIEWS`].
 const PLANES: [Plane; 3] = [Plane::Axial, Plane::Coronal, Plane::Sagittal];
 
 /// Least radius of a body in the 3D view [pixels]: then every pixel along it has its middle inside.
@@ -25,7 +29,9 @@ fn seen_from(capsule: &Capsule, eye: [f64; 3], least: f64) -> Capsule {
 /// Draws frames into memory of its own.
 pub(crate) struct Composer {
     skip: Option<Skip>,
-    pub(crate) pictures: [Picture; 5],
+    pub(crate) pictures: [Picture; VIEWS.len()],
+    /// the map of empty space for a radiograph, which shows other values; with that effect
+    skip_xray: Option<Skip>,
     /// how finely the next 3D view is drawn
     pub quality: Quality,
     /// displacement whose colour over a section is opaque [mm]
@@ -49,11 +55,15 @@ impl Composer {
         let [w, h] = scene.rendering.size;
         let [sw, sh] = if scene.has_effect("sections") { scene.rendering.section_size } else { [0, 0] };
         let section = || Picture::new(sw, sh);
-        let [fw, fh] = if scene.has_effect("ultrasound") { scene.rendering.section_size } else { [0, 0] };
-        let pictures = [Picture::new(w, h), section(), section(), section(), Picture::new(fw, fh)];
+        let small = |name: &str| {
+            let [w, h] = if scene.has_effect(name) { scene.rendering.section_size } else { [0, 0] };
+            Picture::new(w, h)
+        };
+        let pictures = [Picture::new(w, h), section(), section(), section(), small("ultrasound"), small("x-ray")];
         let zoom = scene.has_effect("smooth-surface");
         Self {
             skip: None,
+            skip_xray: None,
             pictures,
             overlay_mm: scene.rendering.overlay_mm,
             quality: Quality::FULL,
@@ -68,11 +78,15 @@ impl Composer {
 
     /// Switches effects off, whose pictures' memory is given back, or on again, as far as the scene calls for them.
     pub fn switch(&mut self, scene: &Scene, switches: &Switches) {
-        let [_, sections @ .., fan] = &mut self.pictures;
-        for (name, pictures) in [("sections", &mut sections[..]), ("ultrasound", std::slice::from_mut(fan))] {
+        let [_, sections @ .., fan, radiograph] = &mut self.pictures;
+        let small = std::slice::from_mut;
+        for (name, pictures) in [("sections", &mut sections[..]), ("ultrasound", small(fan)), ("x-ray", small(radiograph))] {
             let on = scene.has_effect(name) && !registry::place(name).is_some_and(|place| switches.is_off(place));
             let [w, h] = if on { scene.rendering.section_size } else { [0, 0] };
             pictures.iter_mut().filter(|p| [p.width, p.height] != [w, h]).for_each(|p| *p = Picture::new(w, h));
+        }
+        if self.pictures[5].width == 0 {
+            self.skip_xray = None;
         }
     }
 
@@ -108,15 +122,18 @@ impl Composer {
             empty => empty.insert(Skip::new(source, &settings)),
         };
         self.backend.begin();
-        let [whole, sections @ .., fan] = &mut self.pictures;
+        let [whole, sections @ .., fan, radiograph] = &mut self.pictures;
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
         let meshes = self.meshes.views();
         let bodies = Geometry { capsules, meshes: &meshes };
         let [w, h] = [whole.width, whole.height].map(|n| self.quality.pixels(n));
         // what is thinner than a pixel would be dots where it meets the middles of pixels
-        let pixel = 2.0 * (camera.fov_deg.to_radians() / 2.0).tan() / h as f64;
-        let thick: Vec<Capsule> = capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect();
+        let thickened = |camera: &Camera, height: usize| -> Vec<Capsule> {
+            let pixel = 2.0 * (camera.fov_deg.to_radians() / 2.0).tan() / height as f64;
+            capsules.iter().map(|c| seen_from(c, camera.eye, LEAST_PIXELS * pixel)).collect()
+        };
+        let thick = thickened(&camera, h);
         let in_3d = Geometry { capsules: &thick, meshes: &meshes };
         let inside_tool = Geometry { capsules: &[], meshes: &meshes };
         // an endoscope does not see itself
@@ -160,6 +177,21 @@ impl Composer {
             }
         }
         watch.split("ultrasound");
+        if radiograph.width > 0 {
+            // from outside, also while the 3D view looks through an endoscope
+            let (camera, settings) = (view.free_camera(), Settings { step: settings.step, ..Settings::xray() });
+            let skip = match &mut self.skip_xray {
+                Some(skip) => {
+                    skip.update(source, &settings);
+                    skip
+                }
+                empty => empty.insert(Skip::new(source, &settings)),
+            };
+            let thick = thickened(&camera, radiograph.height);
+            let extras = Extras { warp, geometry: Some(&Geometry { capsules: &thick, meshes: &[] }), ..Extras::default() };
+            self.backend.render(&extras, source, skip, &camera, &settings, radiograph)?;
+        }
+        watch.split("x-ray");
         Ok(())
     }
 
@@ -256,6 +288,7 @@ mod tests {
         assert_eq!((composer.bytes(), composer.pictures[1].rgb.capacity()), (64 * 48 * 3, 0));
         switches.switch(place("sections"), true);
         switches.switch(place("ultrasound"), true);
+        switches.switch(place("x-ray"), true);
         composer.switch(&scene, &switches);
         assert_eq!(composer.bytes(), whole, "and nothing that the scene does not call for");
     }

@@ -18,17 +18,18 @@ mod in_place;
 mod meshes;
 mod needle;
 mod organs;
+mod outlet;
 mod overlay;
 #[doc(hidden)]
 pub mod turns;
 mod view;
 
 use maille_contract::needle::{NeedleLog, NeedleState};
-use maille_contract::{FrameHeader, Role, ServiceCell, ToolState, control::Counter};
+use maille_contract::{FrameHeader, Role, ServiceCell, Switches, ToolState, control::Counter};
 use maille_raycast::FrameBudget;
 use maille_scene::{Accuracy, BoxMm, Machine, Plan, Scene, registry::live_knob};
 use maille_store::Reader;
-use maille_transport::{Domain, FramePublisher, Life, Node, Stopwatch, Untimed, monotonic_ns, timed};
+use maille_transport::{Domain, Life, Node, Stopwatch, Untimed, monotonic_ns, timed};
 use std::{
     sync::{Arc, atomic::Ordering::Relaxed},
     time::Duration,
@@ -93,7 +94,7 @@ fn frames<W: Stopwatch + Send>(
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
     let node = Node::open(domain, "rendering")?;
     let mut composer = compose::Composer::new(scene);
-    let frames = node.frame_publisher(composer.bytes())?;
+    let mut frames = outlet::Outlet::open(&node, composer.bytes())?;
     let threads = plan.process(maille_scene::Process::Rendering).map_or(1, |p| p.threads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|n| format!("rays-{n}")).build()?;
     let mut view = view::View::new(scene, &BoxMm::of(&reader.info().grid))?;
@@ -116,6 +117,7 @@ fn frames<W: Stopwatch + Send>(
     // a run whose stages are timed draws every frame, also of what stands: it wants to know what one takes
     let every = life.control().timed.load(Relaxed) != 0;
     // only a scene that calls for something that can be switched looks whether it was
+    let mut switched: Switches = bytemuck::Zeroable::zeroed();
     let mut switches_seen = plan.can_switch(maille_scene::Process::Rendering).then_some(0u64);
     // and there it is the governor that says how finely is drawn, by measured fronts, for every frame
     let adapt = scene.rendering.adapt && knobs_seen.is_none();
@@ -143,6 +145,14 @@ fn frames<W: Stopwatch + Send>(
         }
         if let Some(switches) = switches_seen.as_mut().and_then(|seen| life.control().switched(seen)) {
             composer.switch(scene, &switches);
+            // memory for fewer pictures, or for more; where there is none for more, what could be shown is
+            if frames.fit(composer.bytes()) {
+                switched = switches;
+            } else {
+                composer.switch(scene, &switched);
+            }
+            // what was drawn into, and what rays wrote beside it
+            maille_realtime::heap::trim();
             shown = None;
         }
         let tool = life.control().tool.load::<ToolState>().map(|(tool, _)| tool);
@@ -157,9 +167,11 @@ fn frames<W: Stopwatch + Send>(
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
         let asked = (view.generation(), view.turns());
         let seen = (reader.epoch(), asked, tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
-        let moving = every || shown != Some(seen);
+        let moving = shown != Some(seen);
         shown = Some(seen);
-        let quality = if adapt { budget.next(moving) } else { moving.then_some(view.quality()) };
+        let asked = if adapt { budget.next(moving) } else { moving.then_some(view.quality()) };
+        // what stands is drawn whole, as it would be once
+        let quality = asked.or(every.then(|| view.quality()));
         let was_drawing = std::mem::replace(&mut drew, quality.is_some());
         let Some(quality) = quality else {
             // what stands goes out again, for who has just come to look
@@ -233,7 +245,7 @@ fn frames<W: Stopwatch + Send>(
 }
 
 /// Hands the pictures over as they are.
-fn send(frames: &FramePublisher, composer: &compose::Composer, header: FrameHeader, cell: &ServiceCell) {
+fn send(frames: &outlet::Outlet<'_>, composer: &compose::Composer, header: FrameHeader, cell: &ServiceCell) {
     let bytes = composer.bytes();
     match frames.send(bytes, |pixels| composer.write(pixels, header)) {
         Ok(()) => {

@@ -125,6 +125,35 @@ mod tests {
     }
 
     #[test]
+    fn a_radiograph_is_there_where_it_is_asked_for_is_brighter_behind_bone_and_hides_no_needle() {
+        let bricks = balls();
+        let asked = Scene::parse("x-ray", &scene("").to_toml().replace("[effects]", "[effects]\nx-ray = true")).expect("a scene");
+        let view = View::new(&asked, &BoxMm::of(&bricks.info().grid)).expect("a view");
+        let mut composer = Composer::new(&asked);
+        let mut draw = |needle: Option<&[maille_raycast::Capsule]>| {
+            composer.draw(&bricks, None, &view, None, true, needle, &mut Untimed).expect("it can be drawn");
+            composer.pictures[5].clone()
+        };
+        let plain = draw(None);
+        assert_eq!([plain.width, plain.height], [64, 40]);
+        let centre = |x: usize| i32::from(plain.pixel(x, 20)[0]);
+        let air = i32::from(plain.pixel(1, 1)[0]);
+        let brightest = (0..64).map(centre).max().expect("a row");
+        assert!((brightest - air).abs() > 40, "bone {brightest}, air {air}");
+        assert!(plain.rgb.chunks_exact(3).all(|p| p[0] == p[1] && p[1] == p[2]), "without colour");
+        // a needle across, behind and before the balls
+        let along = |y: f64| maille_raycast::Capsule { a: [-28.0, y, 0.0], b: [28.0, y, 0.0], radius: 0.4, color: [1.0; 3] };
+        for y in [-18.0, 18.0] {
+            let with = draw(Some(&[along(y)]));
+            let changed = with.rgb.chunks_exact(3).zip(plain.rgb.chunks_exact(3)).filter(|(a, b)| a != b).count();
+            assert!((20..600).contains(&changed), "{changed} pixels of a needle at {y} mm");
+        }
+        // not asked for: no picture and no map of empty space
+        let none = Composer::new(&scene(""));
+        assert!(none.pictures[5].rgb.is_empty());
+    }
+
+    #[test]
     fn an_organ_that_is_not_there_is_said() {
         let bricks = balls();
         for (from, to) in [("[17.0, 0.0, 0.0]", "[1.0, 0.0, 0.0]"), ("[17.0, 0.0, 0.0]", "[170.0, 0.0, 0.0]")] {

@@ -1,8 +1,9 @@
 //! Frames one by one, without the loop's rate and its publishing: for measuring what a frame takes. The calling thread's pool draws.
 
-use crate::{RenderingError, breath::Breather, compose::Composer, meshes, organs, view::View};
+use crate::{RenderingError, breath::Breather, compose::Composer, meshes, needle, organs, view::View};
 use maille_breathing::Patient;
-use maille_contract::ToolState;
+use maille_contract::{ToolState, needle::NeedleState};
+use maille_raycast::Capsule;
 use maille_scene::{BoxMm, Scene};
 use maille_store::Reader;
 use maille_transport::{ControlMap, Domain, Untimed};
@@ -14,6 +15,8 @@ pub struct Turns<'a> {
     composer: Composer,
     view: View,
     breather: Option<Breather<'a>>,
+    /// the needle, in a scene with one
+    bodies: Option<Vec<Capsule>>,
 }
 
 impl<'a> Turns<'a> {
@@ -27,7 +30,8 @@ impl<'a> Turns<'a> {
         let mut composer = Composer::new(scene);
         composer.labels = organs::labels(scene, &reader.rest())?;
         composer.meshes = meshes::Meshes::of(scene, &reader.rest())?;
-        Ok(Self { control: ControlMap::open(domain)?, reader, composer, view, breather })
+        let bodies = scene.has_effect("needle").then(Vec::new);
+        Ok(Self { control: ControlMap::open(domain)?, reader, composer, view, breather, bodies })
     }
 
     /// Draws the newest state at a simulation time; false where the view could not be drawn.
@@ -38,7 +42,13 @@ impl<'a> Turns<'a> {
             let moment = breather.moment(time_ns);
             self.composer.meshes.carry(|at| moment.to_world(at));
         }
+        let seen = self.bodies.as_mut().and_then(|room| self.control.needle.load::<NeedleState>().map(|(needle, _)| (room, needle)));
+        let bodies = seen.map(|(room, needle)| {
+            let to_world = |at| self.breather.as_ref().map_or(at, |breather| breather.to_world(time_ns, at));
+            needle::bodies(&needle, None, to_world, room);
+            room.as_slice()
+        });
         let warp = self.breather.as_mut().map(|breather| breather.go(time_ns));
-        self.composer.draw(&snapshot, warp, &self.view, tool.as_ref(), tool.is_some(), None, &mut Untimed).is_ok()
+        self.composer.draw(&snapshot, warp, &self.view, tool.as_ref(), tool.is_some(), bodies, &mut Untimed).is_ok()
     }
 }

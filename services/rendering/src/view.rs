@@ -108,11 +108,14 @@ impl View {
                 let up = if tool.direction[2].abs() > 0.99 { [0.0, -1.0, 0.0] } else { [0.0, 0.0, 1.0] };
                 (Camera::endoscope(tool.tip_mm, tool.direction, up, self.endoscope_fov_deg), true)
             }
-            _ => match &self.page {
-                Some(p) => (Camera { eye: p.eye_mm, target: p.target_mm, up: p.up, fov_deg: p.fov_deg }, false),
-                None => (self.scene_camera, false),
-            },
+            _ => (self.free_camera(), false),
         }
+    }
+
+    /// The camera outside the patient.
+    pub fn free_camera(&self) -> Camera {
+        let led = |p: &ViewState| Camera { eye: p.eye_mm, target: p.target_mm, up: p.up, fov_deg: p.fov_deg };
+        self.page.as_ref().map_or(self.scene_camera, led)
     }
 
     /// Barrel distortion of the 3D view's lens.

@@ -4,7 +4,7 @@
 
 use crate::SupervisorError;
 use maille_governor::FrontPoint;
-use maille_scene::registry;
+use maille_scene::{limits, registry};
 use serde::Deserialize;
 use std::{fs, path::Path};
 
@@ -60,6 +60,23 @@ impl Fronts {
                 "{source} has a front of {name:?}, which is no knob of a scene: `maille tradeoff` writes their names"
             )));
         }
+        for (name, p) in read
+            .fronts
+            .iter()
+            .filter_map(|f| f.knob.as_deref().map(|name| (name, f)))
+            .flat_map(|(name, f)| f.points.iter().map(move |p| (name, p)))
+        {
+            let range = limits::limit(name)
+                .filter(|_| registry::live_knob(name).is_some())
+                .map_or(f64::NEG_INFINITY..=f64::INFINITY, |l| l.low..=l.high);
+            if !(p.time > 0.0 && p.time.is_finite() && p.error >= 0.0 && p.error.is_finite() && range.contains(&p.value)) {
+                return Err(SupervisorError::Refused(format!(
+                    "{source} has a point of {name} that nobody can have measured (value {}, time {}, error {}): `maille tradeoff` writes times above 0, \
+                     errors from 0 on and values that a scene may have",
+                    p.value, p.time, p.error
+                )));
+            }
+        }
         if !read.fronts.iter().any(|f| f.knob.as_deref().is_some_and(|name| registry::live_knob(name).is_some())) {
             return Err(SupervisorError::Refused(format!(
                 "{source} has a front of no knob that turns in a run: `maille tradeoff --quick -o DIR` writes DIR/fronts.json with all"
@@ -98,7 +115,15 @@ mod tests {
     fn what_is_no_file_of_fronts_is_refused_with_the_command_that_makes_one() {
         let path = std::env::temp_dir().join(format!("maille-fronts-{}.json", std::process::id()));
         let misspelt = "{\"fronts\": [{\"knob\": \"rendering.stepp\", \"points\": []}]}";
-        for text in ["", "{}", "{\"fronts\": []}", misspelt, "{\"fronts\": [{\"points\": [{\"value\": null}]}]}"] {
+        let point = |value: f64, time: f64, error: f64| {
+            format!(
+                "{{\"fronts\": [{{\"knob\": \"rendering.step\", \"points\": [{{\"value\": {value}, \"time\": {time}, \"error\": {error}}}]}}]}}"
+            )
+        };
+        let [negative, frozen, beyond] = [point(1.0, -1.0, 0.5), point(1.0, 0.5, -0.5), point(1e9, 0.5, 0.5)];
+        for text in
+            ["", "{}", "{\"fronts\": []}", &negative, &frozen, &beyond, misspelt, "{\"fronts\": [{\"points\": [{\"value\": null}]}]}"]
+        {
             fs::write(&path, text).unwrap();
             let said = Fronts::open(Some(&path)).unwrap_err().to_string();
             assert!(said.contains("maille tradeoff") && said.contains("fronts"), "{said}");

@@ -33,6 +33,7 @@ pub mod octree;
 mod output;
 pub mod patient;
 mod process;
+pub mod recording;
 pub mod report;
 pub mod restart;
 mod signals;
@@ -88,6 +89,8 @@ pub struct RunOptions {
     pub duration: Option<Duration>,
     /// where to write the report
     pub report: Option<PathBuf>,
+    /// where to record the tool's way and the forces, in place of what the scene says
+    pub record: Option<PathBuf>,
     /// what moves the tool, in place of the scene's own
     pub device: Option<Device>,
     /// roles that a person will start with `maille service`
@@ -113,6 +116,9 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     let mut scene = Scene::open(options.scene.as_deref(), options.volume.as_deref())?;
     if let Some(device) = &options.device {
         scene.use_device(device.clone())?;
+    }
+    if let Some(file) = &options.record {
+        scene.use_recording(file)?;
     }
     if let Some(motion) = &options.motion {
         scene.use_motion(motion.clone())?;

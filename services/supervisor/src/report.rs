@@ -13,7 +13,7 @@
 //! | `services.S.restarts` | starts after the first |
 //! | `services.S.private_mib`, `private_peak_mib` | `Private_Dirty` shortly before the end, and the most seen |
 //! | `services.S.stalls` | times without a heartbeat for 0.5 s |
-//! | `services.S.stages` | with `--stages`: `name`, `count` and mean time `us` of each stage of its loop, in order, warm-up included |
+//! | `services.S.stages` | with `--stages`: `name`, `count` and mean time `us` of each stage of its loop, in order, after warm-up |
 //! | `services.S.killed` | it did not end within 1 s when asked |
 //! | `services.haptic.rate_hz`, `overruns` | ticks a second after warm-up; releases missed and not caught up |
 //! | `services.haptic.tick_us`, `lateness_us` | compute of a tick; how late it began: `p50`, `p99`, `p999`, `max` |
@@ -37,9 +37,10 @@
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
 //! | `governor` | with `accuracy = "auto"`: `fronts` where they come from, `ladder` what could be given up, in order, `turns` (time, knob, value, loop, whether accuracy was given up, load), `given_up` what stood so at the end |
 //! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (at the end; null when the needle is out, `withdrawn`), `closest_to_target_mm` and `deepest_to_target_mm` (where the path was deepest) in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` and `residual_mm` of the rod in all `ticks_inside`, `ticks_slowed` and `ticks_unconverged` of them, `faults`, `port_energy_mj` and `port_energy_least_mj` (what the hand put in, less what it got back), `trace` (forces over time, see `trace.rs`; plotted beside the report), `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
+//! | `recording` | in a scene that is recorded: `file`, `moments` (lines), `fault` (why it is not whole) |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
-use crate::{events::Event, governor::GovernorReport, memory::MIB, needle::NeedleReport, watch::Post};
+use crate::{events::Event, governor::GovernorReport, memory::MIB, needle::NeedleReport, recording::RecordingReport, watch::Post};
 use maille_contract::{
     ControlBlock, Role,
     control::{Counter, StageCell},
@@ -257,6 +258,8 @@ pub struct RunReport {
     pub needle: Option<NeedleReport>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub governor: Option<GovernorReport>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recording: Option<RecordingReport>,
     pub events: Vec<Event>,
 }
 

@@ -13,6 +13,7 @@ use crate::{
     needle::NeedleReport,
     octree::Kept,
     patient::{Patient, Progress},
+    recording::Recorder,
     report::{RunReport, ServiceReport, StoreReport},
     say,
     trace::Tracer,
@@ -63,6 +64,8 @@ pub struct Simulation {
     killed: Vec<Role>,
     /// in a scene with a needle
     tracer: Option<Tracer>,
+    /// in a scene that is recorded
+    recorder: Option<Recorder>,
     ended: bool,
 }
 
@@ -119,6 +122,7 @@ impl Simulation {
             segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions + labels::bytes(&scene, &volume.info.grid),
         )?;
 
+        let recorder = scene.recording_file().map(|file| Recorder::create(&file)).transpose()?;
         let domain = Files(Domain::fresh()?);
         let control = ControlMap::create(&domain.0)?;
         control.supervisor_pid.store(std::process::id().into(), Relaxed);
@@ -161,6 +165,7 @@ impl Simulation {
             started_ns: monotonic_ns(),
             killed: Vec::new(),
             tracer: None,
+            recorder,
             ended: false,
         })
     }
@@ -178,6 +183,9 @@ impl Simulation {
         self.control.supervisor_heartbeat_ns.store(self.started_ns, Relaxed);
         self.control.set_run_state(RunState::Running);
         self.tracer = self.scene.has_effect("needle").then(|| Tracer::begin(&self.domain.0)).flatten();
+        if let Some(recorder) = &mut self.recorder {
+            recorder.begin(&self.domain.0, &self.scene.name);
+        }
     }
 
     /// Keeps the run going until its end; see [`Watch::run`].
@@ -225,6 +233,7 @@ impl Simulation {
             ended_by: ended_by.to_owned(),
             services,
             needle: NeedleReport::of(&self.scene, &self.control, self.tracer.take().map(Tracer::end)),
+            recording: self.recorder.take().map(Recorder::end),
             governor: self.pilot.as_ref().map(Pilot::report),
             events: self.events.log().to_vec(),
             store: StoreReport::of(

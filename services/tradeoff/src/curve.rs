@@ -51,7 +51,7 @@ pub struct Context {
 pub enum KnobOf {
     /// of the registry ([`registry::KNOBS`]): its defaults are marked
     Registry(&'static str),
-    /// of an engine alone: no scene turns it; values at draft, balanced and reference where the engine says so
+    /// of an engine alone: no word of `accuracy` turns it; the value that every scene has, three times, where it is one number
     Engine(Option<[f64; 3]>),
 }
 

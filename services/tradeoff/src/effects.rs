@@ -10,7 +10,7 @@
 
 use crate::{TradeoffError, interruption, io, measure::Quartiles, report::load_1m};
 use maille_scene::{
-    EffectSetting, Scene,
+    EffectSetting, Organ, Process, Scene,
     registry::{CalledBy, EFFECTS, Effect, effect},
     sections,
     tool::{Shape, ToolKind},
@@ -110,9 +110,10 @@ impl Measure {
         let services = report["services"].as_object();
         Self {
             tick_us: pair("/services/haptic/tick_us"),
-            step_us: match report.pointer("/services/deformation/commits").and_then(serde_json::Value::as_u64) {
-                Some(0) => Pair { p50: f64::NAN, p99: f64::NAN },
-                _ => pair("/services/deformation/step_us"),
+            // commits are made without a tool move as well (a blade, relaxation): then there is none whose answer could be timed
+            step_us: match pair("/services/deformation/step_us") {
+                none if none.p50 == 0.0 && report.pointer("/services/deformation").is_some() => Pair { p50: f64::NAN, p99: f64::NAN },
+                pair => pair,
             },
             frame_ms: pair("/services/rendering/frame_ms"),
             segments_mib: n("/store/segment_mib"),
@@ -191,6 +192,7 @@ size = [320, 240]
 section_size = [160, 120]
 transfer = "skin"
 from = [0.5, -1.0, 0.2]
+distance = 0.3
 [deformation]
 offset = 0.3
 movement_limit_mm = 30.0
@@ -219,6 +221,10 @@ fn prepare(scene: &mut Scene, name: &str) {
                 (tool.shape, tool.radius_mm) = (Shape::Finger, tool.radius_mm.max(5.0));
             }
         }
+        // a scene that has organs keeps its own
+        "labels" if scene.organs.is_empty() => {
+            scene.organs.push(Organ { name: "bone".into(), hu: vec![[300.0, 3000.0]], islands_mm3: 100.0, ..Organ::default() })
+        }
         "plasticity" => {
             scene.deformation.relaxation = sections::Relaxation::Elastic;
             scene.tissues.iter_mut().for_each(|row| row.plastic = 0.3);
@@ -237,7 +243,7 @@ fn own_tool(name: &str) -> Option<&'static str> {
     }
 }
 
-/// An effect and all it depends on, `view` and what every scene has left out.
+/// An effect and all it depends on, `view` and what every scene has left out; and a tool, where it adds work to that of the hand.
 fn closure(name: &str) -> BTreeSet<&'static str> {
     let mut all = BTreeSet::new();
     let mut wanted = vec![name];
@@ -246,6 +252,7 @@ fn closure(name: &str) -> BTreeSet<&'static str> {
             && all.insert(e.name)
         {
             wanted.extend(e.depends_on);
+            wanted.extend(e.joins.contains(&Process::Haptic).then_some("contact"));
         }
     }
     all
@@ -264,6 +271,9 @@ fn scene_of(base: &Scene, effects: &BTreeSet<&str>) -> Scene {
     if !has_tool {
         scene.tool = None;
     }
+    if !effects.contains("labels") {
+        (scene.organs, scene.rendering.alone) = (Vec::new(), None);
+    }
     for name in effects {
         prepare(&mut scene, name);
     }
@@ -276,6 +286,27 @@ fn scene_of(base: &Scene, effects: &BTreeSet<&str>) -> Scene {
 /// Whether the scene's text is one that `maille run` takes.
 fn fault(scene: &Scene) -> Option<String> {
     Scene::parse("made", &scene.to_toml()).err().map(|e| e.to_string())
+}
+
+/// A scene for each effect of the registry, with what it depends on and nothing else, and `everything`: all that get along, in the registry's order.
+/// `view` is the base taken apart. Each takes its place by standing in the registry.
+///
+/// # Errors
+/// When an effect makes no scene of this base: it is named, with the reason.
+pub fn scenes(base: &Scene) -> Result<Vec<(&'static str, Scene)>, TradeoffError> {
+    let mut all: Vec<(&'static str, Scene)> = vec![("view", scene_of(base, &BTreeSet::new()))];
+    let mut everything = BTreeSet::new();
+    for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always) {
+        let with = closure(e.name);
+        let scene = scene_of(base, &with);
+        if let Some(fault) = fault(&scene) {
+            return Err(TradeoffError::Run(format!("no scene has the effect {}: {fault}", e.name)));
+        }
+        all.push((e.name, scene));
+        join(base, &mut everything, &with);
+    }
+    all.push(("everything", scene_of(base, &everything)));
+    Ok(all)
 }
 
 fn base(options: &EffectsOptions) -> Result<Scene, TradeoffError> {
@@ -328,22 +359,16 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
         let with = closure(e.name);
         let mut without = with.clone();
         without.remove(e.name);
-        if let Some(unbuilt) = with.iter().find(|n| !effect(n).is_some_and(|e| e.available)) {
-            notes.insert(e.name.into(), format!("declared for later{}", if *unbuilt == e.name { "" } else { " by what it depends on" }));
-        } else if let Some(fault) = fault(&scene_of(&base, &with)) {
+        if let Some(fault) = fault(&scene_of(&base, &with)) {
             notes.insert(e.name.into(), format!("this scene cannot have it: {fault}"));
         } else {
-            if let Some(kind) = own_tool(e.name) {
+            if let Some(kind) = own_tool(e.name).filter(|_| with.contains("deformation")) {
                 notes.insert(
                     e.name.into(),
                     format!("its tool is {kind}: steps are not those of a push, and what is added to them says nothing"),
                 );
             }
-            // all together: as long as the scene takes them
-            let union: BTreeSet<&str> = everything.union(&with).copied().collect();
-            if fault_free(&base, &union) {
-                everything = union;
-            } else {
+            if !join(&base, &mut everything, &with) {
                 left_out.push(e.name);
             }
         }
@@ -351,8 +376,12 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
     }
     if options.only.is_empty() {
         wanted.push(("everything".into(), everything.clone(), nothing.clone()));
-        if !left_out.is_empty() {
-            notes.insert("everything".into(), format!("without {}", left_out.join(", ")));
+        let tool = everything.iter().find_map(|name| own_tool(name));
+        let held = tool.map(|kind| format!("its tool is {kind}: steps are not those of a push"));
+        let without = (!left_out.is_empty()).then(|| format!("without {}, which do not get along with the others", left_out.join(", ")));
+        let note: Vec<String> = without.into_iter().chain(held).collect();
+        if !note.is_empty() {
+            notes.insert("everything".into(), note.join("; "));
         }
     }
 
@@ -421,6 +450,17 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
     })
 }
 
+/// Adds effects to a set, where one scene and one tool can have them all.
+fn join(base: &Scene, all: &mut BTreeSet<&'static str>, more: &BTreeSet<&'static str>) -> bool {
+    let union: BTreeSet<&str> = all.union(more).copied().collect();
+    let tools: BTreeSet<&str> = union.iter().filter_map(|name| own_tool(name)).collect();
+    let fits = tools.len() <= 1 && fault_free(base, &union);
+    if fits {
+        *all = union;
+    }
+    fits
+}
+
 fn fault_free(base: &Scene, effects: &BTreeSet<&str>) -> bool {
     fault(&scene_of(base, effects)).is_none()
 }
@@ -430,6 +470,9 @@ fn command(options: &EffectsOptions) -> String {
     words.extend(options.scene.iter().map(|s| s.display().to_string()));
     words.extend(options.volume.iter().map(|v| format!("--volume {}", v.display())));
     words.push(format!("--duration {}s", options.duration.as_secs_f64()));
+    if !options.only.is_empty() {
+        words.push(format!("--only {}", options.only.join(",")));
+    }
     if options.rounds > 1 {
         words.push(format!("--rounds {}", options.rounds));
     }
@@ -460,6 +503,10 @@ fn run(options: &EffectsOptions, scene: &Scene, scratch: &Path, interrupted: &At
     let _ = fs::remove_file(&report);
     let log = fs::File::create(&said).map_err(io(format!("{} cannot be written", said.display())))?;
     let and = log.try_clone().map_err(io("a file cannot be opened twice"))?;
+    let mut record = Vec::new();
+    if scene.recording_file().is_some() {
+        record = vec!["--record".into(), scratch.join("record.csv")];
+    }
     let mut child = Command::new(&options.program)
         .arg0("maille")
         // its own group: Ctrl-C comes here, and is passed on once
@@ -468,6 +515,7 @@ fn run(options: &EffectsOptions, scene: &Scene, scratch: &Path, interrupted: &At
         .arg(&file)
         .args(["--headless", "--stages", "--duration", &format!("{}ms", options.duration.as_millis()), "--report"])
         .arg(&report)
+        .args(record)
         .stdin(Stdio::null())
         .stdout(log)
         .stderr(and)
@@ -514,20 +562,21 @@ impl EffectsReport {
     /// A table for a README.
     pub fn to_markdown(&self) -> String {
         let mut out = String::from(
-            "| effect | over | tick µs p50, p99 | step µs p50, p99 | frame ms p50, p99 | shared MiB | private MiB | processes |\n|---|---|---|---|---|---|---|---|\n",
+            "| effect | over | tick µs p50, p99 | step µs p50, p99 | frame ms p50, p99 | shared MiB | private MiB | processes | |\n|---|---|---|---|---|---|---|---|---|\n",
         );
         for e in &self.effects {
             let cells = e.added.as_ref().map_or_else(
-                || format!("{} | | | | |", e.note.as_deref().unwrap_or("not measured")),
+                || format!("{} | | | | | |", e.note.as_deref().unwrap_or("not measured")),
                 |a| {
                     format!(
-                        "{} | {} | {} | {:+.1} | {:+.1} | {}",
+                        "{} | {} | {} | {:+.1} | {:+.1} | {} | {}",
                         a.tick_us,
                         a.step_us,
                         a.frame_ms,
                         a.segments_mib,
                         a.private_mib,
-                        e.processes_added.join(", ")
+                        e.processes_added.join(", "),
+                        e.note.as_deref().unwrap_or("")
                     )
                 },
             );
@@ -579,9 +628,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_effect_of_the_registry_makes_a_scene_that_runs_or_is_declared_for_later() {
+    fn every_effect_of_the_registry_makes_a_scene_that_runs() {
         let base = Scene::parse("the base scene", BASE).unwrap();
-        for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always && e.available) {
+        for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always) {
             let with = closure(e.name);
             let scene = scene_of(&base, &with);
             assert_eq!(fault(&scene), None, "{}: give it what it needs in `prepare`", e.name);
@@ -589,6 +638,23 @@ mod tests {
             let mut without = with.clone();
             assert!(without.remove(e.name));
             assert!(fault_free(&base, &without) && !scene_of(&base, &without).has_effect(e.name), "{}", e.name);
+        }
+    }
+
+    #[test]
+    fn each_effect_of_the_registry_has_a_scene_to_be_measured_in_and_all_together_have_one() {
+        let scenes = scenes(&Scene::parse("the base scene", BASE).unwrap()).unwrap();
+        let names: Vec<&str> = scenes.iter().map(|(name, _)| *name).collect();
+        let registered: Vec<&str> = EFFECTS.iter().map(|e| e.name).collect();
+        assert_eq!(names[..names.len() - 1], registered[..], "the view first, then the others in order");
+        for (name, scene) in &scenes {
+            assert_eq!(fault(scene), None, "{name}");
+            assert!(*name == "everything" || scene.has_effect(name), "{name}");
+        }
+        // tools of several kinds do not get along; whatever needs none of its own does
+        let everything = &scenes.last().unwrap().1;
+        for e in EFFECTS.iter().filter(|e| own_tool(e.name).is_none() && e.name != "palpation") {
+            assert!(everything.has_effect(e.name), "{} is left out", e.name);
         }
     }
 

@@ -33,6 +33,7 @@ use std::{
         Arc,
         atomic::{AtomicBool, Ordering::Relaxed},
     },
+    time::{Duration, Instant},
 };
 use thiserror::Error;
 
@@ -65,6 +66,8 @@ pub struct Options {
     pub only: Vec<String>,
     /// how long to take
     pub effort: Effort,
+    /// by when all must be done; later curves are measured in fewer rounds, or left out, and the report says which
+    pub within: Option<Duration>,
     /// a patient of one's own
     pub volume: Option<PathBuf>,
     /// the folder of real data
@@ -85,11 +88,11 @@ pub fn chosen(only: &[String]) -> Result<Vec<&'static Curve>, TradeoffError> {
     Ok(curves().filter(|c| only.is_empty() || only.iter().any(|name| fits(c, name))).collect())
 }
 
-/// A flag that Ctrl-C and SIGTERM raise.
+/// A flag that Ctrl-C and SIGTERM raise; a second one ends the program at once.
 ///
 /// # Errors
 /// When signals cannot be received.
-pub(crate) fn interruption() -> Result<Arc<AtomicBool>, TradeoffError> {
+pub fn interruption() -> Result<Arc<AtomicBool>, TradeoffError> {
     let flag = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
         // a second one ends the program at once
@@ -111,16 +114,28 @@ pub fn tradeoff(options: &Options, mut told: impl FnMut(&Curve)) -> Result<Repor
     let context =
         Context { effort: options.effort, volume: options.volume.clone(), data: options.data.clone(), patients: Patients::default() };
     let mut report = Report::begin(options);
-    for curve in chosen {
+    let (begun, mut longest) = (Instant::now(), Duration::ZERO);
+    for (n, curve) in chosen.iter().enumerate() {
+        let (before, to_come) = (begun.elapsed(), (chosen.len() - n) as u32);
+        // a curve may take as long as the longest so far
+        if options.within.is_some_and(|within| before + longest > within) {
+            report.leave_out(curve);
+            continue;
+        }
         told(curve);
         let mut measured = Vec::new();
         // errors are worked out on all processors, times taken on one
-        for subject in (curve.bench)(&context)? {
+        let subjects = (curve.bench)(&context)?;
+        let (prepared, count) = (begun.elapsed(), subjects.len().max(1) as u32);
+        // of what is left each curve has its share, and a half of that for its rounds
+        let share = options.within.map(|within| within.saturating_sub(prepared) / (2 * to_come * count));
+        for subject in subjects {
             if interrupted.load(Relaxed) {
                 return Err(TradeoffError::Interrupted);
             }
-            measured.push(pool.install(|| measure::measure(curve, subject, options.effort)));
+            measured.push(pool.install(|| measure::measure(curve, subject, options.effort, share)));
         }
+        longest = longest.max(begun.elapsed() - before);
         report.add(curve, measured, options);
     }
     report.end();

@@ -83,16 +83,21 @@ pub struct MeasuredSubject {
     pub subject: String,
     /// rounds
     pub rounds: usize,
+    /// whether time was up before there were as many as usual
+    pub cut_short: bool,
     /// settings, in the bench's order
     pub points: Vec<Point>,
     /// what the lines show
     pub monotone: Monotone,
 }
 
-/// Times a subject's settings and judges them. Give it the pool of one thread that the work shall run on.
-pub fn measure(curve: &Curve, mut subject: Subject, effort: Effort) -> MeasuredSubject {
-    let budget = effort.pick(Duration::from_millis(700), Duration::from_secs(4));
-    let (least, most) = effort.pick((3, 41), (7, 201));
+/// Times a subject's settings and judges them, within a time where one is given (then one round at least is made). Give it the pool of one thread
+/// that the work shall run on.
+pub fn measure(curve: &Curve, mut subject: Subject, effort: Effort, within: Option<Duration>) -> MeasuredSubject {
+    let usual = effort.pick(Duration::from_millis(700), Duration::from_secs(4));
+    let budget = within.map_or(usual, |within| within.min(usual));
+    let (usual_least, most) = effort.pick((3, 41), (7, 201));
+    let least = |spent: Duration| if within.is_some_and(|within| spent >= within) { 1 } else { usual_least };
     let count = subject.settings.len();
     let mut times = vec![Vec::new(); count];
     // the first round fills caches and working memory
@@ -103,14 +108,15 @@ pub fn measure(curve: &Curve, mut subject: Subject, effort: Effort) -> MeasuredS
     let mut rounds = 0;
     let mut order: Vec<usize> = (0..count).collect();
     let mut seed = 0x9E37_79B9_7F4A_7C15u64;
-    while count > 0 && (rounds < least || (rounds < most && start.elapsed() < budget)) {
+    while count > 0 && (rounds < least(start.elapsed()) || (rounds < most && start.elapsed() < budget)) {
         shuffle(&mut order, &mut seed);
         for &n in &order {
             times[n].push((subject.settings[n].run)() * 1e3);
         }
         rounds += 1;
     }
-    judge(curve, subject.name, &subject.settings, &times)
+    let cut_short = rounds < usual_least || (budget < usual && rounds < most && start.elapsed() < usual);
+    MeasuredSubject { cut_short, ..judge(curve, subject.name, &subject.settings, &times) }
 }
 
 /// Another order, the same in every run [Fisher and Yates; xorshift].
@@ -159,7 +165,7 @@ pub fn judge(curve: &Curve, name: String, settings: &[Setting], times: &[Vec<f64
         points[n].front = on;
     }
     let monotone = monotone(&points, curve.theory);
-    MeasuredSubject { subject: name, rounds: times.first().map_or(0, Vec::len), points, monotone }
+    MeasuredSubject { subject: name, rounds: times.first().map_or(0, Vec::len), cut_short: false, points, monotone }
 }
 
 /// For each point whether it is on the front.

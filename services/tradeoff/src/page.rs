@@ -43,6 +43,9 @@ pub(crate) fn tradeoff(report: &Report) -> String {
     for curve in &report.curves {
         section(&mut body, curve);
     }
+    for cut in &report.cut_short {
+        let _ = write!(body, "<p class=\"small\">Cut short: {}</p>", escaped(cut));
+    }
     for skipped in &report.skipped {
         let _ = write!(body, "<p class=\"small\">Skipped: {}</p>", escaped(skipped));
     }
@@ -89,6 +92,9 @@ fn section(body: &mut String, curve: &MeasuredCurve) {
         escaped(curve.timed),
         escaped(&curve.command)
     );
+    if curve.defaults.is_none() {
+        *body += "<p class=\"small\">No word of <code>accuracy</code> chooses here: a scene or an engine does.</p>";
+    }
     for subject in &curve.subjects {
         let _ = write!(body, "<h3>{}</h3><div class=\"pair\"><figure>{}</figure>", escaped(&subject.subject), scatter(subject, curve.unit));
         table(body, subject, curve.unit);

@@ -7,10 +7,12 @@
 //! | `curves[].name`, `engine`, `knob` | name for `--only`; crate; the registry's knob or null |
 //! | `curves[].title`, `error`, `unit`, `truth`, `timed`, `command` | what is turned, what is wrong by it and against what, what is timed, and the command that measures it again |
 //! | `curves[].defaults` | values at draft, balanced, reference, or null |
-//! | `curves[].subjects[].subject`, `rounds` | what it was measured on; rounds |
+//! | `curves[].subjects[].subject`, `rounds`, `cut_short` | what it was measured on; rounds; whether they are fewer than usual, for want of time |
 //! | `curves[].subjects[].points[]` | `line`, `label`, `value`, `error`, `worst`, `time_ms` and `ratio` (`q1`, `median`, `q3`), `front`, `is_reference`, `accuracy` |
 //! | `curves[].subjects[].monotone` | `holds`, `expected`, `breaks`, `explanation` |
 //! | `fronts[]` | for each curve `name`, `knob` (null where the registry has none), `unit`, and `points` from cheap to dear: `value`, `time` (over that of the setting of `reference`), `error` |
+//! | `within_s` | by when all had to be done, or null |
+//! | `cut_short[]` | what that left out, or measured in fewer rounds than usual; empty where there was time enough |
 //! | `skipped[]` | curves that had nothing to be measured on, and what they need |
 
 use crate::{
@@ -106,6 +108,8 @@ pub struct Report {
     pub fronts: Vec<Front>,
     /// curves without a subject, and what they need
     pub skipped: Vec<String>,
+    pub within_s: Option<f64>,
+    pub cut_short: Vec<String>,
     #[serde(skip)]
     begun: Option<Instant>,
 }
@@ -127,11 +131,21 @@ impl Report {
             curves: Vec::new(),
             fronts: Vec::new(),
             skipped: Vec::new(),
+            within_s: options.within.map(|within| within.as_secs_f64()),
+            cut_short: Vec::new(),
             begun: Some(Instant::now()),
         }
     }
 
+    /// For a curve that there is no time for.
+    pub(crate) fn leave_out(&mut self, curve: &Curve) {
+        self.cut_short.push(format!("{}: not measured, time was up", curve.name));
+    }
+
     pub(crate) fn add(&mut self, curve: &Curve, subjects: Vec<MeasuredSubject>, options: &Options) {
+        for subject in subjects.iter().filter(|s| s.cut_short) {
+            self.cut_short.push(format!("{} on {}: {} rounds, fewer than usual", curve.name, subject.subject, subject.rounds));
+        }
         if subjects.is_empty() {
             self.skipped.push(format!("{}: needs --full and the real data (MAILLE_DATA)", curve.name));
             return;
@@ -257,6 +271,9 @@ impl fmt::Display for Report {
                     writeln!(f, "    not monotone{}: {}", if m.expected { ", NOT EXPECTED" } else { "" }, m.breaks.join("; "))?;
                 }
             }
+            if curve.defaults.is_none() {
+                writeln!(f, "  no word of `accuracy` chooses here: a scene or an engine does")?;
+            }
             // once a curve, where a line turns back
             if let Some(why) = curve.subjects.iter().find(|s| !s.monotone.holds).and_then(|s| s.monotone.explanation) {
                 writeln!(f, "  why: {why}")?;
@@ -264,6 +281,12 @@ impl fmt::Display for Report {
         }
         for skipped in &self.skipped {
             writeln!(f, "\nSKIPPED {skipped}")?;
+        }
+        for cut in &self.cut_short {
+            writeln!(f, "\nCUT SHORT {cut}")?;
+        }
+        if let Some(within_s) = self.within_s.filter(|_| !self.cut_short.is_empty()) {
+            writeln!(f, "\nall had to be done within {within_s:.0} s: `--full`, `--only` or a quieter machine give the whole")?;
         }
         write!(
             f,

@@ -39,10 +39,27 @@ fn names_choose_curves_by_name_by_engine_and_by_beginning() {
     assert!(chosen(&["nothing".into()]).is_err_and(|e| e.to_string().contains("rendering.step")));
 }
 
+/// Whatever is asked for: what there is no time for is named, and what was measured in haste as well.
+#[test]
+fn what_there_is_no_time_for_is_left_out_by_its_name() {
+    let only = vec!["contact".into()];
+    let options = Options { only, effort: Effort::Quick, within: Some(std::time::Duration::from_millis(20)), volume: None, data: None };
+    let report = tradeoff(&options, |_| {}).unwrap();
+    let asked = chosen(&options.only).unwrap();
+    assert!(!report.cut_short.is_empty() && report.curves.len() < asked.len(), "20 ms are enough for {:?}", report.took_s);
+    for curve in asked {
+        let measured = report.curves.iter().find(|c| c.name == curve.name);
+        let named = report.cut_short.iter().any(|line| line.starts_with(curve.name));
+        assert!(named || measured.is_some_and(|c| c.subjects.iter().all(|s| s.rounds >= 3)), "{} is silent", curve.name);
+    }
+    let shown = report.to_string();
+    assert!(report.cut_short.iter().all(|line| shown.contains(line) && report.to_html().contains(line)), "{shown}");
+}
+
 /// Two knobs of touch, which are done in a second: the marked settings, the front for a governor, the page.
 #[test]
 fn a_report_has_its_marks_its_front_and_a_page_with_every_curve() {
-    let options = Options { only: vec!["contact".into()], effort: Effort::Quick, volume: None, data: None };
+    let options = Options { only: vec!["contact".into()], effort: Effort::Quick, within: None, volume: None, data: None };
     let report = tradeoff(&options, |_| {}).unwrap();
     assert_eq!(report.curves.len(), chosen(&options.only).unwrap().len());
     let page = report.to_html();

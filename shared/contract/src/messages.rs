@@ -212,7 +212,7 @@ pub struct DeviceForce {
 }
 
 /// Views in a frame, in this order.
-pub const VIEWS: [&str; 5] = ["3d", "axial", "coronal", "sagittal", "ultrasound"];
+pub const VIEWS: [&str; 6] = ["3d", "axial", "coronal", "sagittal", "ultrasound", "x-ray"];
 
 /// Where a view's pixels lie in a frame.
 #[repr(C)]
@@ -230,7 +230,7 @@ pub struct ViewRect {
 /// User header of a frame. Writer: rendering. Reader: console.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("maille.FrameHeader/v2")]
+#[type_name("maille.FrameHeader/v3")]
 pub struct FrameHeader {
     /// sender's stamp
     pub stamp: Stamp,
@@ -243,7 +243,7 @@ pub struct FrameHeader {
     /// simulation time of what is shown [ns]: where a patient who breathes lay
     pub shown_ns: u64,
     /// the views, in the order of [`VIEWS`]; 0 × 0 where the scene has none
-    pub views: [ViewRect; 5],
+    pub views: [ViewRect; VIEWS.len()],
 }
 
 fn finite(numbers: &[f64]) -> bool {

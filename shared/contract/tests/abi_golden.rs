@@ -43,7 +43,7 @@ fn messages_keep_their_names_sizes_and_offsets() {
         window_width_hu: 136, sections_mm: 144, sections_follow_tool: 168, transfer_count: 176, transfer: 184);
     message!(ToolCommand, "maille.ToolCommand/v1", 64, stamp: 0, taken: 24, target_mm: 32, sent_ns: 56);
     message!(ViewRect, "maille.ViewRect/v1", 16, offset: 0, width: 8, height: 12);
-    message!(FrameHeader, "maille.FrameHeader/v2", 136, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, shown_ns: 48, views: 56);
+    message!(FrameHeader, "maille.FrameHeader/v3", 152, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, shown_ns: 48, views: 56);
     message!(Ping, "maille.Ping/v1", 256, time_ns: 0, sequence: 8, rest: 16);
     message!(Pong, "maille.Pong/v1", 256, time_ns: 0, sequence: 8, rest: 16);
 }

@@ -38,7 +38,7 @@ pub struct Ladder {
     rungs: Vec<Rung>,
 }
 
-/// What stands at a setting: as it was measured, or straight between its neighbours.
+/// What stands at a setting: as it was measured, straight between its neighbours, or, beyond what was measured, as at that end.
 fn at<'a>(value: f64, points: impl Iterator<Item = &'a FrontPoint>) -> Option<FrontPoint> {
     let (mut below, mut above): (Option<&FrontPoint>, Option<&FrontPoint>) = (None, None);
     for p in points {
@@ -49,18 +49,18 @@ fn at<'a>(value: f64, points: impl Iterator<Item = &'a FrontPoint>) -> Option<Fr
             above = Some(p);
         }
     }
-    let (a, b) = below.zip(above)?;
+    let (a, b) = (below.or(above)?, above.or(below)?);
     let share = if b.value > a.value { (value - a.value) / (b.value - a.value) } else { 0.0 };
     let mix = |of: fn(&FrontPoint) -> f64| of(a) + (of(b) - of(a)) * share;
     Some(FrontPoint { value, time: mix(|p| p.time), error: mix(|p| p.error) })
 }
 
-/// Error of a setting: as it was measured, or straight between its neighbours; none outside what was measured.
+/// Error of a setting: as it was measured, straight between its neighbours, or as at the end of what was measured; none where nothing was.
 pub fn error_at(points: &[FrontPoint], value: f64) -> Option<f64> {
     at(value, points.iter().filter(|p| p.value.is_finite() && p.time.is_finite() && p.error.is_finite())).map(|p| p.error)
 }
 
-/// Time of a setting over that of the reference, likewise.
+/// Time of a setting over that of the reference, likewise: of one finer than was measured too little, so that what turning it saves is said with care.
 pub fn time_at(points: &[FrontPoint], value: f64) -> Option<f64> {
     at(value, points.iter().filter(|p| p.value.is_finite() && p.time.is_finite() && p.error.is_finite())).map(|p| p.time)
 }
@@ -81,7 +81,7 @@ impl Ladder {
 
     /// Adds the rungs of a knob below those that are there: from the setting `from` down the front of `points`, as far as errors of `most`.
     /// Points that others beat in both error and time, or that are no numbers, are left out; so are steps that save next to nothing. Where
-    /// `from` itself was not measured, its time and error are taken straight between its neighbours; outside what was measured there is no rung.
+    /// `from` itself was not measured, its time and error are taken straight between its neighbours, or from the end of what was measured.
     #[must_use]
     pub fn then(mut self, knob: &str, of: Loop, part: Part, from: f64, most: f64, points: &[FrontPoint]) -> Self {
         let sound = |p: &&FrontPoint| p.value.is_finite() && p.time.is_finite() && p.time > 0.0 && p.error.is_finite();

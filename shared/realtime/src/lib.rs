@@ -3,13 +3,15 @@
 //! - [`Period`] releases a loop at a fixed rate on the monotonic clock, counts what it missed, and never catches up;
 //! - [`enter_realtime`] and [`lock_memory`] ask the system for SCHED_FIFO, one CPU, a small timer slack and locked pages;
 //!   what is refused becomes a [`Notice`], never an error: the loop runs on, less punctual;
-//! - [`CountingAllocator`] and [`steady`] count allocations in a stretch of code that must make none.
+//! - [`CountingAllocator`] and [`steady`] count allocations in a stretch of code that must make none;
+//! - [`heap::trim`] gives freed memory back.
 //!
-//! Unsafe is confined to [`clock`], [`period`], [`schedule`] (system calls) and [`allocation`] (the allocator's trait).
+//! Unsafe is confined to [`clock`], [`heap`], [`period`], [`schedule`] (system calls) and [`allocation`] (the allocator's trait).
 //! Units: nanoseconds of CLOCK_MONOTONIC as `u64`. Linux only.
 
 pub mod allocation;
 pub mod clock;
+pub mod heap;
 pub mod period;
 pub mod schedule;
 

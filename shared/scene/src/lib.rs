@@ -22,6 +22,7 @@ pub mod organ;
 mod pairs;
 pub mod path;
 pub mod plan;
+pub mod recording;
 pub mod registry;
 pub mod resolve;
 pub mod scene;

@@ -7,7 +7,7 @@ use crate::{
     breathing::Signal,
     error::{Fault, SceneError, Source},
     limits::{LIMITS, range_text},
-    mesh, organ, pairs,
+    mesh, organ, pairs, recording,
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, PhantomKind, Scene, Size},
     sections::{Mode, TouchedSurface},
@@ -112,7 +112,20 @@ impl Scene {
         Ok(())
     }
 
-    /// Chooses what moves the tool, as `--device` does; reads the way points of `path:FILE`.
+    /// Has the tool's way and the forces kept in a file, as `--record` does.
+    ///
+    /// # Errors
+    /// When the scene has no tool.
+    pub fn use_recording(&mut self, file: &Path) -> Result<(), SceneError> {
+        if self.tool.is_none() {
+            return Err(SceneError::sentence("this scene has no [tool] whose way could be recorded", Some("add a [tool] table".into())));
+        }
+        let file = toml::Value::String(file.display().to_string());
+        self.effects.insert("recording".into(), EffectSetting::Settings([("file".to_owned(), file)].into_iter().collect()));
+        Ok(())
+    }
+
+    /// Chooses what moves the tool, as `--device` does; reads the way points of `path:FILE`, or of a recording, `path:FILE.csv`.
     pub fn use_device(&mut self, device: Device) -> Result<(), SceneError> {
         let Some(tool) = &mut self.tool else {
             return Err(SceneError::sentence("this scene has no [tool] for a device to move", Some("add a [tool] table".into())));
@@ -128,6 +141,15 @@ impl Scene {
             }
             let text = fs::read_to_string(&file)
                 .map_err(|e| SceneError::sentence(format!("cannot read the way points {}: {e}", file.display()), None))?;
+            if file.extension().is_some_and(|e| e == "csv") {
+                let moments = recording::read(&text)
+                    .map_err(|(line, why)| SceneError::sentence(format!("{}:{line}: {why}", file.display()), None))?;
+                if moments.is_empty() {
+                    return Err(SceneError::sentence(format!("nothing was recorded in {}", file.display()), None));
+                }
+                (tool.path, tool.looped, tool.period_s, tool.device) = (recording::way(&moments), false, None, Device::Path);
+                return Ok(());
+            }
             let document = Document::new(&file.display().to_string(), &text)?;
             let read: PathFile = document.deserialise()?;
             let mut faults = Vec::new();
@@ -577,13 +599,13 @@ fn check_effects(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
                 faults.push(document.fault(&format!("{path}.enabled"), "`enabled` is true or false", "neither", None));
             }
         }
+        if let EffectSetting::Settings(table) = setting
+            && table.get("file").is_some_and(|v| v.as_str().is_none_or(str::is_empty))
+        {
+            faults.push(document.fault(&format!("{path}.file"), "`file` is the name of a file", "no name", None));
+        }
         if !setting.is_on() {
             continue;
-        }
-        if !effect.available {
-            let help = Some("take it out of the scene, or set it to false".into());
-            let message = format!("the effect `{name}` ({}) is declared for later and not built yet", effect.summary);
-            faults.push(document.fault(&path, message, "not built yet", help));
         }
         for needed in effect.depends_on.iter().filter(|n| !scene.has_effect(n)) {
             let help = match registry::effect(needed).map(|e| e.called_by) {

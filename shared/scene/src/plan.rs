@@ -93,7 +93,8 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
     let mut processes = Vec::new();
     for process in [Process::Deformation, Process::Haptic, Process::Rendering] {
         if wants(process) {
-            let stages = effects.iter().flat_map(|e| e.stages).filter(|s| s.process == process).copied().collect();
+            let replaced = |s: &&Stage| effects.iter().any(|e| e.replaces.contains(&s.name));
+            let stages = effects.iter().flat_map(|e| e.stages).filter(|s| s.process == process && !replaced(s)).copied().collect();
             processes.push(ProcessPlan { process, threads: threads(process, scene, machine), rate_hz: rate(process, scene), stages });
         }
     }
@@ -144,8 +145,8 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
 
     let pixels = |[w, h]: [usize; 2]| 3 * w * h;
     let sections = if scene.has_effect("sections") { 3 * pixels(scene.rendering.section_size) } else { 0 };
-    let fan = if scene.has_effect("ultrasound") { pixels(scene.rendering.section_size) } else { 0 };
-    let frame_bytes = pixels(scene.rendering.size) + sections + fan;
+    let small = ["ultrasound", "x-ray"].into_iter().filter(|name| scene.has_effect(name)).count() * pixels(scene.rendering.section_size);
+    let frame_bytes = pixels(scene.rendering.size) + sections + small;
 
     let knobs = KNOBS.iter().filter(|k| effects.iter().any(|e| e.name == k.effect)).map(|k| (k, (k.get)(scene))).collect();
     let panels = if scene.console.enabled { effects.iter().flat_map(|e| e.panels).copied().collect() } else { Vec::new() };
@@ -214,13 +215,7 @@ impl Plan {
 }
 
 fn is_active(effect: &Effect, scene: &Scene) -> bool {
-    effect.available
-        && match effect.called_by {
-            CalledBy::Always => true,
-            CalledBy::Section("tool") => scene.tool.is_some(),
-            CalledBy::Section(_) => false,
-            CalledBy::Effects => scene.has_effect(effect.name),
-        }
+    effect.called_by == CalledBy::Always || scene.has_effect(effect.name)
 }
 
 fn rate(process: Process, scene: &Scene) -> Option<f64> {

@@ -1,8 +1,7 @@
 //! The registry: every effect a scene can call for and every knob it can turn, each with what it needs and costs.
 //!
 //! A part that adds an effect or a knob adds an entry here and nothing else; the plan derives from these tables alone
-//! ([`crate::plan`]), so that what no entry asks for is not there at run time. Entries with `available: false` are
-//! declared for a later part: a scene that asks for one is refused with a sentence saying so.
+//! ([`crate::plan`]), so that what no entry asks for is not there at run time. Whatever stands here can be run.
 
 use crate::{scene::Scene, sections::Metric};
 use maille_volume::brick::{Brick, EDGE};
@@ -67,8 +66,6 @@ pub static CUTS: Channel = Channel {
     meaning: "links that are cut, a bit for each of three a voxel; strokes of incision",
     brick_bytes: EDGE * EDGE * EDGE,
 };
-/// Labels.
-pub static LABELS: Channel = Channel { name: "labels", meaning: "a label for each voxel, u8", brick_bytes: EDGE * EDGE * EDGE };
 
 /// The octree's leaves of bricks that were rewritten: a table, and as many bytes as the blocks' voxels. Where nothing moves there are none.
 pub static OCTREE: Channel = Channel {
@@ -137,6 +134,8 @@ pub struct Effect {
     pub channels: &'static [&'static Channel],
     /// work that it adds
     pub stages: &'static [Stage],
+    /// stages of others in whose place its own run
+    pub replaces: &'static [&'static str],
     /// panels it adds to the page
     pub panels: &'static [&'static str],
     /// effects without which it makes no sense
@@ -147,8 +146,6 @@ pub struct Effect {
     pub hard_cases: &'static [&'static str],
     /// whether a scene that calls for it may switch it off and on again while it runs; a matter of one process alone
     pub live: bool,
-    /// false: declared for later
-    pub available: bool,
 }
 
 impl Effect {
@@ -162,18 +159,13 @@ impl Effect {
             joins: &[],
             channels: &[],
             stages: &[],
+            replaces: &[],
             panels: &[],
             depends_on: &[],
             settings: &[],
             hard_cases: &[],
             live: false,
-            available: true,
         }
-    }
-
-    /// An entry declared for later.
-    const fn later(name: &'static str, summary: &'static str, depends_on: &'static [&'static str]) -> Self {
-        Self { depends_on, available: false, ..Self::named(name, summary) }
     }
 }
 
@@ -293,6 +285,7 @@ pub static EFFECTS: &[Effect] = &[
     Effect {
         processes: &[Process::Haptic],
         stages: &[stage(Process::Haptic, "needle", Per::Tick)],
+        replaces: &["contact", "world to reference", "force to world"],
         depends_on: &["contact"],
         hard_cases: &[
             "three to two hundred nodes",
@@ -308,7 +301,6 @@ pub static EFFECTS: &[Effect] = &[
     },
     Effect {
         joins: &[Process::Haptic, Process::Rendering],
-        stages: &[stage(Process::Haptic, "smooth surface", Per::Tick), stage(Process::Rendering, "zoom", Per::Frame)],
         depends_on: &["contact"],
         hard_cases: &["constant values", "a step", "sheets of one voxel", "odd sizes", "commits under the tip"],
         ..Effect::named("smooth-surface", "what is felt (`haptic.surface`) and seen from near is the surface of a smooth function")
@@ -327,11 +319,17 @@ pub static EFFECTS: &[Effect] = &[
     Effect {
         processes: &[Process::Deformation],
         channels: &[&DISPLACEMENT],
-        stages: &[stage(Process::Haptic, "drag", Per::Tick), stage(Process::Deformation, "needle-drag", Per::Step)],
+        stages: &[stage(Process::Deformation, "needle-drag", Per::Step)],
         depends_on: &["needle", "deformation"],
         ..Effect::named("needle-drag", "a needle drags tissue along: its voxels move with shaft and tip (ChainMail)")
     },
-    Effect::later("x-ray", "a fluoroscopic view", &[]),
+    Effect {
+        processes: &[Process::Rendering],
+        stages: &[stage(Process::Rendering, "x-ray", Per::Frame)],
+        panels: &["x-ray"],
+        live: true,
+        ..Effect::named("x-ray", "a radiograph from where the patient is seen, with the needle and a tool that is held in it")
+    },
     Effect {
         processes: &[Process::Rendering],
         stages: &[stage(Process::Rendering, "ultrasound", Per::Frame)],
@@ -341,9 +339,16 @@ pub static EFFECTS: &[Effect] = &[
         hard_cases: &["a probe in the air", "bone and gas before tissue", "a probe that looks nowhere"],
         ..Effect::named("ultrasound", "what a probe at the tool's tip would see, made from CT")
     },
-    Effect::later("surfaces", "meshes extracted live", &[]),
-    Effect { channels: &[&LABELS], ..Effect::later("labels", "organs by label", &[]) },
-    Effect::later("recording", "a record that can be replayed", &[]),
+    Effect {
+        called_by: CalledBy::Section("organ"),
+        joins: &[Process::Rendering],
+        ..Effect::named("labels", "organs (rows of `[[organ]]`) found by their values, coloured in the views, or one of them shown alone")
+    },
+    Effect {
+        depends_on: &["contact"],
+        settings: &["file"],
+        ..Effect::named("recording", "the tool's way and the forces over time, in a file that `--device path:FILE` plays again")
+    },
 ];
 
 /// Place in [`EFFECTS`] of one that counts as not registered; beyond the end: none does.
@@ -404,7 +409,7 @@ pub static KNOBS: &[Knob] = &[
         stage: Some((Process::Rendering, "ray casting")),
         summary: "distance of samples along a ray, in units of the smallest spacing",
         defaults: [2.0, 1.0, 0.5],
-        error: "difference of the picture [part of full scale]",
+        error: "difference of the picture [% of full scale]",
         truth: "the same picture at step 0.1",
         cost: "frame time grows as 1/step",
         get: |s| s.rendering.step,
@@ -416,7 +421,7 @@ pub static KNOBS: &[Knob] = &[
         stage: Some((Process::Rendering, "ray casting")),
         summary: "share of the full width and height at which the 3D view is drawn; scaled up by straight interpolation",
         defaults: [0.5, 1.0, 1.0],
-        error: "difference of the picture [part of full scale]",
+        error: "difference of the picture [% of full scale]",
         truth: "the same picture drawn whole, at step 0.1",
         cost: "frame time grows as its square",
         get: |s| s.rendering.scale,
@@ -428,7 +433,7 @@ pub static KNOBS: &[Knob] = &[
         stage: Some((Process::Rendering, "ray casting")),
         summary: "a ray ends when this part of the light is used up",
         defaults: [0.95, 0.99, 0.999],
-        error: "light left out, at most 1 − this [part of full scale]",
+        error: "difference of the picture [% of full scale]; light left out is at most 1 − this",
         truth: "the same picture without an early end",
         cost: "frame time, by the samples behind the surface",
         get: |s| s.rendering.opacity_end,
@@ -490,7 +495,7 @@ pub static KNOBS: &[Knob] = &[
         defaults: [16.0, 16.0, 32.0],
         error: "bound on the error of a stored vector [mm]",
         truth: "the vector before it is stored",
-        cost: "memory, twice as much for 32",
+        cost: "memory, twice as much for 32; steps of 16 bits take a little more time than single precision where they lie in a cache",
         get: |s| s.breathing.precision_bits.into(),
         set: |s, v| s.breathing.precision_bits = v as u32,
     },
@@ -611,7 +616,7 @@ mod tests {
     fn every_knob_has_a_range_that_holds_its_defaults_and_reads_what_it_writes() {
         for knob in KNOBS {
             let limit = limit(knob.name).unwrap_or_else(|| panic!("{} has no range", knob.name));
-            assert!(effect(knob.effect).is_some_and(|e| e.available), "{} belongs to no effect", knob.name);
+            assert!(effect(knob.effect).is_some(), "{} belongs to no effect", knob.name);
             if let Some((process, stage)) = knob.stage {
                 let known = EFFECTS.iter().flat_map(|e| e.stages).any(|s| s.process == process && s.name == stage);
                 assert!(known, "{} turns {stage}, which no effect has", knob.name);
@@ -633,6 +638,9 @@ mod tests {
             assert!(EFFECTS[..n].iter().all(|other| other.name != e.name), "{} stands twice", e.name);
             for name in e.depends_on {
                 assert!(effect(name).is_some(), "{} depends on {name}", e.name);
+            }
+            for name in e.replaces {
+                assert!(EFFECTS.iter().flat_map(|other| other.stages).any(|s| s.name == *name), "{} replaces {name}", e.name);
             }
             // a stage without its process would never run
             for s in e.stages.iter().filter(|s| !e.processes.contains(&s.process) && !e.joins.contains(&s.process)) {

@@ -6,6 +6,7 @@ use crate::{
     mesh::Mesh,
     needle::Needle,
     organ::Organ,
+    recording,
     sections::{Console, Deformation, Haptic, Memory, Rendering, TouchedSurface},
     tissue::{self, Tissue},
     tool::{DeviceSection, Tool},
@@ -231,13 +232,24 @@ impl Default for Scene {
 }
 
 impl Scene {
-    /// Whether the scene calls for an effect by its name in `[effects]` (or, for `contact`, by having a `[tool]`).
+    /// Whether the scene calls for an effect by its name in `[effects]` (or, for `contact` and `labels`, by having a `[tool]`, an `[[organ]]`).
     pub fn has_effect(&self, name: &str) -> bool {
         match name {
             "contact" => self.tool.is_some(),
             "view" => true,
+            "labels" => !self.organs.is_empty(),
             _ => self.effects.get(name).is_some_and(EffectSetting::is_on),
         }
+    }
+
+    /// Where the tool's way and forces are recorded; none: nowhere.
+    pub fn recording_file(&self) -> Option<PathBuf> {
+        let setting = self.effects.get("recording").filter(|setting| setting.is_on())?;
+        let named = match setting {
+            EffectSetting::Switch(_) => None,
+            EffectSetting::Settings(table) => table.get("file").and_then(toml::Value::as_str),
+        };
+        Some(named.unwrap_or(recording::FILE).into())
     }
 
     /// The surface that is felt.

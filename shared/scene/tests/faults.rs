@@ -116,8 +116,12 @@ fn all_faults_of_a_scene_are_told_at_once() {
 fn effects_are_known_available_and_not_alone() {
     let error = fault("[effects]\nsection = true");
     assert_eq!(error.to_string(), "scene.toml:2: unknown effect `section`, did you mean `sections`?");
-    let error = fault("[effects]\nx-ray = true");
-    assert!(error.to_string().contains("declared for later and not built yet"), "{error}");
+    let error = fault("[effects]\nlabels = true");
+    assert!(error.to_string().contains("unknown effect `labels`"), "what a table calls for is not asked for by its name: {error}");
+    let error = fault("[effects]\nrecording = true");
+    assert!(error.to_string().contains("needs `contact`"), "{error}");
+    let error = fault("[tool]\n[tool.approach]\n[effects]\nrecording = { file = 3 }");
+    assert!(error.to_string().contains("`file` is the name of a file"), "{error}");
     let error = fault("[effects]\nneedle = true");
     assert!(error.to_string().contains("needs a needle to be held"), "{error}");
     let error = fault("[effects]\ndeformation = true");

@@ -4,7 +4,7 @@
 //! branch taken; [`Timed`] reads the clock after each stage and adds to the service's cell. Which one a process has is decided once, when it starts
 //! ([`timed`]): `maille run --stages`, the rehearsal of `maille check`, and `maille effects`.
 
-use crate::{ControlMap, Domain, Life, TransportError, monotonic_ns};
+use crate::{ControlMap, Domain, Life, TransportError, life::WARM_UP_NS, monotonic_ns};
 use maille_contract::{Role, control::STAGES};
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -28,7 +28,7 @@ impl Stopwatch for Untimed {
     fn split(&mut self, _: &'static str) {}
 }
 
-/// Adds up the time of each stage. Allocates nothing while it runs.
+/// Adds up the time of each stage, from the end of warm-up on, as all times of a report. Allocates nothing while it runs.
 pub struct Timed {
     control: ControlMap,
     role: Role,
@@ -44,7 +44,11 @@ impl Stopwatch for Timed {
     fn split(&mut self, stage: &'static str) {
         let now = monotonic_ns();
         if let Some(place) = self.names.iter().position(|name| *name == stage) {
-            self.control.service(self.role).stages[place].record(now.saturating_sub(self.last_ns));
+            let cell = self.control.service(self.role);
+            let ready_ns = cell.ready_ns.load(Relaxed);
+            if ready_ns > 0 && self.last_ns >= ready_ns.saturating_add(WARM_UP_NS) {
+                cell.stages[place].record(now.saturating_sub(self.last_ns));
+            }
         }
         self.last_ns = now;
     }
@@ -79,6 +83,13 @@ mod tests {
         assert!(timed(&domain, &life, Role::Rendering, ["a"]).unwrap().is_none(), "nobody asked");
         control.timed.store(1, Relaxed);
         let mut watch = timed(&domain, &life, Role::Rendering, ["a", "b"]).unwrap().unwrap();
+        // not ready yet, warming up, and warm
+        watch.start();
+        watch.split("a");
+        control.service(Role::Rendering).ready_ns.store(monotonic_ns(), Relaxed);
+        watch.start();
+        watch.split("a");
+        control.service(Role::Rendering).ready_ns.store(1, Relaxed);
         watch.start();
         std::thread::sleep(std::time::Duration::from_millis(4));
         watch.split("b");

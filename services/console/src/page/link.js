@@ -1,7 +1,7 @@
 // The socket: comes back by itself, gives texts and frames on, acknowledges a frame once it is drawn.
 
-const VIEWS = ["3d", "axial", "coronal", "sagittal", "ultrasound"];
-const MAGIC = 0x32464c4d; // "MLF2"
+const VIEWS = ["3d", "axial", "coronal", "sagittal", "ultrasound", "x-ray"];
+const MAGIC = 0x33464c4d; // "MLF3"
 const HEADER = 40 + 8 * VIEWS.length;
 
 export class Link {

@@ -55,6 +55,8 @@ const top = {
     $("scene").textContent = m.facts.scene;
     $("description").textContent = m.facts.description;
     document.title = `maille – ${m.facts.scene}`;
+    // panels of effects that the scene does not call for
+    for (const e of document.querySelectorAll("[data-panel]")) e.hidden = !m.facts.panels.includes(e.dataset.panel);
   },
   state: (m) => {
     if (m.state) $("time").textContent = `${m.state.time_s.toFixed(1)} s`;

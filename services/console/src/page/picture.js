@@ -2,7 +2,12 @@
 
 const $ = (id) => document.getElementById(id);
 
+// For so long after a click the server's word on a switch may be older than the click.
+const OWN_SWITCH_MS = 700;
+
 export class Picture {
+  switched = {}; // when each effect was switched here
+
   constructor(model, mouse) {
     this.mouse = mouse;
     const on = (id, event, patch) => $(id).addEventListener(event, (e) => { const p = patch(e.target); if (Object.values(p).every((v) => v === v)) model.edit(p); });
@@ -17,7 +22,10 @@ export class Picture {
     on("window-width", "input", (e) => ({ window_width_hu: e.valueAsNumber }));
     on("follow", "change", (e) => ({ sections_follow_tool: e.checked }));
     // effects that the scene lets be switched, as the server names them
-    $("effects").addEventListener("change", (e) => model.link.send({ type: "effect", name: e.target.name, on: e.target.checked }));
+    $("effects").addEventListener("change", (e) => {
+      this.switched[e.target.name] = performance.now();
+      model.link.send({ type: "effect", name: e.target.name, on: e.target.checked });
+    });
     $("reset-camera").onclick = () => mouse.resetCamera();
   }
 
@@ -52,6 +60,7 @@ export class Picture {
         return label;
       }));
     }
-    for (const [name, on] of list) if (document.activeElement !== $(`effect-${name}`) || on) $(`effect-${name}`).checked = on;
+    // what was just clicked is not on its way back yet
+    for (const [name, on] of list) if (!(performance.now() - this.switched[name] < OWN_SWITCH_MS)) $(`effect-${name}`).checked = on;
   }
 }

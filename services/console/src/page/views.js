@@ -2,7 +2,7 @@
 
 import { PLANES, SectionMap, CameraMap, letter, add, dot } from "/geometry.js";
 
-const TITLES = { "3d": "3D", axial: "Axial", coronal: "Coronal", sagittal: "Sagittal", ultrasound: "Ultrasound" };
+const TITLES = { "3d": "3D", axial: "Axial", coronal: "Coronal", sagittal: "Sagittal", ultrasound: "Ultrasound", "x-ray": "X-ray" };
 const AXIS_COLOURS = ["#e57373", "#81c784", "#64b5f6"]; // sagittal x, coronal y, axial z
 const SILENT_MS = 1000;
 
@@ -20,6 +20,9 @@ export class Views {
     for (const view of this.list) if (!(view.name in frame.views)) view.clear();
     this.draw();
   }
+
+  // What the scene does not call for has no place.
+  hello({ facts }) { for (const v of this.list) if (!facts.panels.includes(v.name)) v.element.hidden = true; }
 
   state() { this.draw(); }
   draw() {
@@ -60,15 +63,16 @@ export class View {
     bitmap.close();
   }
 
-  // The scene has no such view, or it is switched off: nothing of it is kept.
+  // The scene has no such view, or it is switched off: nothing of it is kept, and its place goes to the others.
   clear() {
     if (this.image.width > 4) { this.image.width = 4; this.image.height = 3; }
+    this.element.hidden = this.name !== "3d";
   }
 
   get isSection() { return this.name in PLANES; }
 
-  // The fan of a probe: nothing is drawn over it, and the mouse does nothing in it.
-  get isFan() { return this.name === "ultrasound"; }
+  // The fan of a probe, and a radiograph: nothing is drawn over them, and the mouse does nothing in them.
+  get isPlain() { return this.element.classList.contains("plain"); }
 
   // Mapping between patient and the picture's pixels.
   map() {
@@ -111,7 +115,7 @@ export class View {
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, box.width, box.height);
     g.font = "600 12px system-ui, sans-serif";
-    if (this.isFan) return void this.title.replaceChildren(TITLES[this.name]);
+    if (this.isPlain) return void this.title.replaceChildren(TITLES[this.name]);
     const map = this.map();
     const screen = ([x, y]) => [(x + 0.5) * scale + left, (y + 0.5) * scale + top];
     if (this.isSection) { this.lines(g, map, screen, box); this.scaleBar(g, scale / map.mm, box); }

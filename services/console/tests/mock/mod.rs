@@ -72,6 +72,7 @@ impl Mock {
             endoscope_fov_deg: 90.0,
             transfer: "ct".into(),
             transfer_points: Vec::new(),
+            panels: vec!["3d", "axial", "coronal", "sagittal", "force", "threshold", "incision", "breathing"],
             has_tool: true,
             incises: true,
             breathing: Some("synthetic".into()),
@@ -235,7 +236,7 @@ impl Feed for Mock {
             view_sequence: self.view.stamp.sequence,
             render_ns: self.now_ns() - now,
             shown_ns: now,
-            views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2), ViewRect::default()],
+            views: [ViewRect { offset: 0, width: w, height: h }, rect(0), rect(1), rect(2), ViewRect::default(), ViewRect::default()],
         };
         show(&header, &payload);
         true

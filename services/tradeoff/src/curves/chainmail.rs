@@ -83,7 +83,7 @@ pub(super) static CURVES: &[Curve] = &[
     Curve {
         name: "chainmail.relaxation_sweeps",
         engine: "chainmail",
-        knob: KnobOf::Engine(Some([1.0, 4.0, 16.0])),
+        knob: KnobOf::Engine(Some([4.0; 3])),
         title: "sweeps of elastic relaxation after the push, the sphere held in place",
         error: "mean distance of displacements from those at which relaxation settles, for a push of 1 mm (of what moves)",
         unit: "mm",

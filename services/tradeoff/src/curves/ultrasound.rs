@@ -21,7 +21,7 @@ pub(super) static CURVES: &[Curve] = &[
     Curve {
         name: "ultrasound.lines",
         engine: "raycast",
-        knob: KnobOf::Engine(Some([96.0, 192.0, 384.0])),
+        knob: KnobOf::Engine(Some([192.0; 3])),
         title: "lines of the fan",
         error: ERROR,
         unit: "%",
@@ -33,7 +33,7 @@ pub(super) static CURVES: &[Curve] = &[
     Curve {
         name: "ultrasound.step_mm",
         engine: "raycast",
-        knob: KnobOf::Engine(Some([0.5, 0.25, 0.125])),
+        knob: KnobOf::Engine(Some([0.25; 3])),
         title: "distance of samples along a line",
         error: ERROR,
         unit: "%",
