@@ -20,6 +20,7 @@ pub mod error;
 mod forcedimension;
 #[allow(unsafe_code)] // calls into vendors' shared objects; each block has its reason
 mod foreign;
+mod guard;
 mod inverse3;
 pub mod link;
 pub mod mounting;

@@ -4,15 +4,16 @@
 //! tells so, and looks again every [`RETRY`]. Reports and commands pass through latest-value cells: the tick's calls are loads and
 //! stores, never waits.
 //!
-//! Safe side: a command older than [`SILENT_NS`] counts as zero force (the tick hangs or died); forces that are not finite or beyond the
-//! profile are held; after a reconnection the force rises again over [`RISE_NS`]; on drop the device gets zero force before it is closed.
+//! Safe side (`guard`): a command older than [`SILENT_NS`] counts as zero force (the tick hangs or died); forces that are not finite or beyond the
+//! profile are held; after a reconnection the force rises again over [`RISE_NS`]; on drop the device's force fades to zero before it is closed.
 
-use crate::{DeviceError, Mounting, mounting};
+use crate::{DeviceError, Mounting, guard::Guard, mounting};
 use bytemuck::{Pod, Zeroable};
 use maille_contact::{Device, DevicePose, DeviceProfile, DeviceStatus};
 use maille_contract::cell::LatestCell;
 use maille_realtime::{enter_realtime, monotonic_ns};
 use std::{
+    cell::RefCell,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
@@ -100,6 +101,8 @@ struct Shared {
     /// exchanges so far, and those that came late
     exchanges: AtomicU64,
     late: AtomicU64,
+    /// part of the force that is given on the way back from a silence, as the bits of an f64
+    share: AtomicU64,
 }
 
 /// A real device as the tick sees it.
@@ -143,6 +146,7 @@ impl RemoteDevice {
             opened_ns: AtomicU64::new(0),
             exchanges: AtomicU64::new(0),
             late: AtomicU64::new(0),
+            share: AtomicU64::new(1f64.to_bits()),
         });
         let for_thread = Arc::clone(&shared);
         let serve = move || {
@@ -172,8 +176,12 @@ impl RemoteDevice {
 
 impl Device for RemoteDevice {
     fn read(&mut self, _now_ns: u64) -> DevicePose {
+        // a place that is none is no place: the last one stays, and is not vouched for
+        let mut sound = true;
         if let Some((report, _)) = self.shared.report.load::<Report>() {
-            (self.last, self.seen) = (report, true);
+            sound = report.position_mm.iter().all(|v| v.is_finite());
+            let position_mm = if sound { report.position_mm } else { self.last.position_mm };
+            (self.last, self.seen) = (Report { position_mm, ..report }, true);
         }
         self.status = match (self.seen && self.shared.connected.load(Relaxed), self.last.ready == 1) {
             (false, _) => DeviceStatus::Unplugged,
@@ -191,7 +199,7 @@ impl Device for RemoteDevice {
             // in the patient's millimetres, as the position
             velocity_mm_s: (self.last.has_velocity == 1)
                 .then(|| self.mounting.turn(self.last.velocity_mm_s).map(|v| v * self.mounting.scale)),
-            valid: self.status == DeviceStatus::Connected,
+            valid: sound && self.status == DeviceStatus::Connected,
         }
     }
 
@@ -223,7 +231,8 @@ impl Device for RemoteDevice {
     }
 
     fn gives(&self) -> f64 {
-        if self.shared.connected.load(Relaxed) { risen(self.shared.opened_ns.load(Relaxed), monotonic_ns()) } else { 0.0 }
+        let share = f64::from_bits(self.shared.share.load(Relaxed));
+        if self.shared.connected.load(Relaxed) { share * risen(self.shared.opened_ns.load(Relaxed), monotonic_ns()) } else { 0.0 }
     }
 
     fn status(&self) -> DeviceStatus {
@@ -308,10 +317,10 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
         shared.opened.fetch_add(1, Relaxed);
         let began = monotonic_ns();
         shared.opened_ns.store(began, Relaxed);
-        let mut last_ns = None;
+        let (mut last_ns, guard) = (None, RefCell::new(Guard::new(profile, began)));
         let opened = Opened(&mut driver, shared);
         while !shared.stop.load(Relaxed) {
-            let command = || safe(shared.command.load::<Command>().map(|(command, _)| command), monotonic_ns(), began, profile);
+            let command = || guard.borrow_mut().pass(shared.command.load::<Command>().map(|(command, _)| command), monotonic_ns());
             let mut report = match opened.0.exchange(&command) {
                 Ok(report) => report,
                 Err(error) => {
@@ -323,24 +332,28 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
                 }
             };
             report.taken_ns = monotonic_ns();
-            if report.position_mm.iter().all(|v| v.is_finite()) {
-                shared.report.store(&report);
-                shared.connected.store(true, Relaxed);
-                said.heard(report.ready == 1, profile.name, tell);
-                if report.warning != 0 && report.warning != warned {
-                    let (name, code) = (profile.name, report.warning);
-                    tell(&format!(
-                        "the device ({name}) warns ({code:#06x}: warm motors, or too large a force or too fast a hand for it); its force is lowered"
-                    ));
-                    warned = report.warning;
-                }
+            shared.report.store(&report);
+            shared.connected.store(true, Relaxed);
+            said.heard(report.ready == 1, profile.name, tell);
+            if report.warning != 0 && report.warning != warned {
+                let (name, code) = (profile.name, report.warning);
+                tell(&format!(
+                    "the device ({name}) warns ({code:#06x}: warm motors, or too large a force or too fast a hand for it); its force is lowered"
+                ));
+                warned = report.warning;
             }
             shared.exchanges.fetch_add(1, Relaxed);
+            shared.share.store(guard.borrow().share().to_bits(), Relaxed);
             let late = last_ns.replace(report.taken_ns).is_some_and(|last| report.taken_ns - last > LATE_NS);
             shared.late.fetch_add(u64::from(late), Relaxed);
         }
         if shared.stop.load(Relaxed) {
-            // a device that keeps its last force must not keep this one
+            // whoever ends in order has let go before; who panics has not, and a device that keeps its last force must not keep this one
+            let until = Instant::now() + LET_GO / 2;
+            while guard.borrow().gives()
+                && Instant::now() < until
+                && opened.0.exchange(&|| guard.borrow_mut().pass(None, monotonic_ns())).is_ok()
+            {}
             let _ = opened.0.exchange(&Command::zeroed);
         }
         drop(opened);
@@ -351,19 +364,8 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
 }
 
 /// What part of its force a device gives that was opened then.
-fn risen(opened_ns: u64, now_ns: u64) -> f64 {
+pub(crate) fn risen(opened_ns: u64, now_ns: u64) -> f64 {
     (now_ns.saturating_sub(opened_ns) as f64 / RISE_NS as f64).min(1.0)
-}
-
-/// The command that the device gets: nothing when the tick is silent, within the profile, and rising after the device came.
-fn safe(given: Option<Command>, now_ns: u64, opened_ns: u64, profile: &DeviceProfile) -> Command {
-    let Some(given) = given.filter(|c| now_ns.saturating_sub(c.given_ns) <= SILENT_NS) else { return Command::zeroed() };
-    let rise = risen(opened_ns, now_ns);
-    let hold = |v: [f64; 3], max: f64| {
-        let length = v.iter().map(|c| c * c).sum::<f64>().sqrt();
-        if !length.is_finite() || length == 0.0 { [0.0; 3] } else { v.map(|c| c * rise * (max / length).min(1.0)) }
-    };
-    Command { force_n: hold(given.force_n, profile.max_force_n), torque_n_mm: hold(given.torque_n_mm, profile.max_torque_n_mm), ..given }
 }
 
 #[cfg(test)]
@@ -410,20 +412,5 @@ mod tests {
             ["the toy is not there: no cable", "not ready", "is ready", "the toy stopped answering: unplugged", "is there; its force"];
         assert_eq!(told.len(), parts.len(), "{told:?}");
         assert!(told.iter().zip(parts).all(|(sentence, part)| sentence.contains(part)), "{told:?}");
-    }
-
-    #[test]
-    fn what_reaches_a_device_is_bounded_fresh_and_rises() {
-        let given = |force_n| Some(Command { force_n, torque_n_mm: [1.0; 3], given_ns: 1_000_000_000, reserved: 0 });
-        let at = |force, now, opened| safe(given(force), now, opened, &TOUCH);
-        assert_eq!(at([1.0, 0.0, 0.0], 1_000_000_000, 0).force_n, [1.0, 0.0, 0.0]);
-        assert_eq!(at([1.0, 0.0, 0.0], 1_000_000_000, 0).torque_n_mm, [0.0; 3], "a device without torque");
-        assert_eq!(at([1.0, 0.0, 0.0], 1_000_000_001 + SILENT_NS, 0), Command::zeroed());
-        assert_eq!(at([f64::NAN, 0.0, 0.0], 1_000_000_000, 0).force_n, [0.0; 3]);
-        assert_eq!(at([f64::INFINITY, 0.0, 0.0], 1_000_000_000, 0).force_n, [0.0; 3]);
-        let large = at([0.0, 30.0, 40.0], 1_000_000_000, 0).force_n;
-        assert!((large[1] - 0.6 * 3.3).abs() < 1e-12 && (large[2] - 0.8 * 3.3).abs() < 1e-12);
-        assert!((at([1.0, 0.0, 0.0], 1_000_000_000, 1_000_000_000 - RISE_NS / 4).force_n[0] - 0.25).abs() < 1e-12);
-        assert_eq!(safe(None, 0, 0, &TOUCH), Command::zeroed());
     }
 }

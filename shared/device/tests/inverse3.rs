@@ -154,7 +154,8 @@ fn an_inverse3_lives_through_unplugging_with_either_form_of_the_protocol() {
         let rate = (device.exchanges() - before) as f64 / ((monotonic_ns() - began) as f64 * 1e-9);
         println!("service {}: {rate:.0} exchanges a second, pose {:.2} ms old", if new { "3.5" } else { "3.4" }, device.pose_age_s() * 1e3);
         assert!(rate > 100.0, "{rate} a second, on however busy a machine");
-        assert_eq!(service.force(), [0.5, -0.25, 0.125], "the force arrives in the form that this service knows");
+        let arrived = |_: &RemoteDevice| service.force() == [0.5, -0.25, 0.125];
+        assert!(ticks(&mut device, 5.0, [0.5, -0.25, 0.125], arrived), "the force arrives in the form that this service knows");
         assert_eq!(service.shared.refused.load(Relaxed), 0, "and in no other");
 
         thread::sleep(Duration::from_millis(400));

@@ -66,6 +66,14 @@ impl Mock {
     fn torque(&self) -> [f64; 3] {
         self.three("mock_torque")
     }
+    /// Largest force [N], and largest change in an exchange, since the last call of `clear_steps`.
+    fn steps(&self) -> (f64, f64) {
+        let [largest, steepest, _] = self.three("mock_steps");
+        (largest, steepest)
+    }
+    fn clear_steps(&self) {
+        self.set("mock_clear_steps", 0);
+    }
     fn set(&self, name: &str, value: i32) {
         // SAFETY: the type that the stand-in declares.
         let set = unsafe { self.0.get::<extern "C" fn(i32)>(name.as_bytes()) }.unwrap();
@@ -127,7 +135,8 @@ fn lives_through_unplugging(kind: Kind, mock: &str) {
     let rate = (device.exchanges() - before) as f64 / ((monotonic_ns() - began) as f64 * 1e-9);
     println!("{}: {rate:.0} exchanges a second, pose {:.2} ms old", kind.name(), device.pose_age_s() * 1e3);
     assert!(rate > 100.0, "{rate} a second, on however busy a machine");
-    assert_eq!(other.force(), [0.5, -0.25, 0.125], "the force arrives, after its rise");
+    let arrived = |_: &RemoteDevice| other.force() == [0.5, -0.25, 0.125];
+    assert!(ticks(&mut device, 5.0, [0.5, -0.25, 0.125], arrived), "the force arrives, after its rise");
 
     // a tick that hangs: zero force
     std::thread::sleep(Duration::from_millis(400));
@@ -218,6 +227,43 @@ fn torque_arrives_where_the_device_can_and_within_its_profile() {
     close(arrives(&mut premium, &mock, [0.0, 900.0, 0.0]), [170.0, 0.0, 0.0]);
     drop(premium);
     close(mock.torque(), [0.0; 3]);
+}
+
+/// Who holds a device and panics has not let go: its force fades before it is closed, and so it does where a tick only falls silent.
+#[test]
+fn a_panic_or_a_silence_lets_go_of_a_device_without_a_step() {
+    let path = built("dhd", "panic");
+    let mock = Mock::of(&path);
+    mock.clear_steps();
+    let options = Options { library: Some(path), ..Options::default() };
+    let panicked = std::thread::spawn(move || {
+        let mut device = open(Kind::ForceDimension, &options).unwrap();
+        assert!(ticks(&mut device, 5.0, [0.0; 3], |d| d.status() == DeviceStatus::Connected), "it is found");
+        // no faster than a tick may: 0.02 N each
+        for n in 0..150 {
+            device.read(monotonic_ns());
+            device.write([0.0, 0.0, 0.02 * f64::from(n)]);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let until = monotonic_ns() + 100_000_000;
+        while monotonic_ns() < until {
+            device.write([0.0, 0.0, 3.0]);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // silent for long enough to be let go of, and back
+        std::thread::sleep(Duration::from_millis(120));
+        for _ in 0..100 {
+            device.write([0.0, 0.0, 3.0]);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        panic!("the loop breaks its own invariant");
+    });
+    assert!(panicked.join().is_err());
+    let (largest, steepest) = mock.steps();
+    println!("at most {largest:.2} N, by {steepest:.3} N an exchange");
+    assert!(largest == 3.0 && mock.force() == [0.0; 3] && !mock.is_open(), "{largest} {:?}", mock.force());
+    // up to here by 0.02 N a tick, of which a busy machine may lay some into one exchange
+    assert!(steepest <= 0.25, "{steepest} N in one exchange");
 }
 
 /// A servo loop that runs nothing leaves no reading: the device is lost, is told of once, gives no made-up pose, and comes back.

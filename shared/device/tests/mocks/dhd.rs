@@ -4,8 +4,8 @@
 use std::ffi::{c_char, c_double, c_int, c_uchar, c_uint};
 use std::sync::Mutex;
 
-struct State { plugged: bool, open: bool, enabled: bool, wrench: [f64; 6], watchdog: u8, position: [f64; 3] }
-static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enabled: false, wrench: [0.0; 6], watchdog: 0, position: [0.01, 0.02, 0.03] });
+struct State { plugged: bool, open: bool, enabled: bool, wrench: [f64; 6], watchdog: u8, position: [f64; 3], largest: f64, steepest: f64 }
+static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enabled: false, wrench: [0.0; 6], watchdog: 0, position: [0.01, 0.02, 0.03], largest: 0.0, steepest: 0.0 });
 
 fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 } else { -1 } }
 
@@ -34,7 +34,14 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
     there()
 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdSetForceAndTorqueAndGripperForce(fx: c_double, fy: c_double, fz: c_double, tx: c_double, ty: c_double, tz: c_double, _g: c_double, _id: c_char) -> c_int {
-    STATE.lock().unwrap().wrench = [fx, fy, fz, tx, ty, tz];
+    {
+        let mut s = STATE.lock().unwrap();
+        let norm = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let [x, y, z, ..] = s.wrench;
+        s.steepest = s.steepest.max(norm([fx - x, fy - y, fz - z]));
+        s.largest = s.largest.max(norm([fx, fy, fz]));
+        s.wrench = [fx, fy, fz, tx, ty, tz];
+    }
     there()
 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdEnableForce(on: c_uchar, _id: c_char) -> c_int { STATE.lock().unwrap().enabled = on == 1; there() }
@@ -54,6 +61,12 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
     // SAFETY: the test gives place for three doubles.
     unsafe { std::ptr::copy_nonoverlapping(torque.as_ptr().add(3), to, 3) };
 }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_steps(to: *mut c_double) {
+    let s = STATE.lock().unwrap();
+    // SAFETY: the test gives place for three doubles.
+    unsafe { std::ptr::copy_nonoverlapping([s.largest, s.steepest, 0.0].as_ptr(), to, 3) };
+}
+#[unsafe(no_mangle)] pub extern "C" fn mock_clear_steps(_: c_int) { let mut s = STATE.lock().unwrap(); (s.largest, s.steepest) = (0.0, 0.0); }
 #[unsafe(no_mangle)] pub extern "C" fn mock_watchdog() -> c_int { STATE.lock().unwrap().watchdog.into() }
 #[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { c_int::from(STATE.lock().unwrap().open) }
 #[unsafe(no_mangle)]
