@@ -38,6 +38,8 @@ enum Command {
     #[command(hide = true)]
     LatencyHelper(commands::latency::HelperArgs),
     #[command(hide = true)]
+    VetDevice(commands::vet::Args),
+    #[command(hide = true)]
     Turns(commands::turns::Args),
     Doctor(commands::doctor::Args),
     Clean(commands::clean::Args),
@@ -73,6 +75,7 @@ fn main() -> ExitCode {
         Command::Tradeoff(args) => commands::tradeoff::run(&args),
         Command::Effects(args) => commands::effects::run(&args),
         Command::LatencyHelper(args) => commands::latency::help(&args),
+        Command::VetDevice(args) => commands::vet::run(&args),
         Command::Turns(args) => commands::turns::run(&args),
         Command::Doctor(args) => commands::doctor::run(&args),
         Command::Clean(args) => commands::clean::run(&args),

@@ -118,7 +118,7 @@ fn a_tool_at_rest_on_breathing_skin_feels_the_phase_and_no_step_and_sees_what_it
     // once more, by a field of vectors of its own
     let model = patient.model();
     let motion = Motion::new(&model.fields().iter().map(|f| f.unpack(model.grid())).collect::<Vec<_>>()).unwrap();
-    let mut warp = Warp::new(&info, WarpOptions { tolerance_mm: 0.05, pitch_mm: 6.0 });
+    let mut warp = Warp::new(&info, WarpOptions::default());
     let (mut residual, mut picture): (f64, f64) = (0.0, 0.0);
     for (n, tool) in seen.iter().chain(&after).enumerate() {
         let at = patient.at(tool.stamp.time_ns);

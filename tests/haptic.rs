@@ -1,14 +1,19 @@
 //! The haptic process in whole runs: what its loop asks of the system, seen from outside; a real device's way to it and back; and the hand
 //! while another process is frozen. Kills are `fault_injection`'s matter.
 //!
-//! `MAILLE_SECONDS=60 cargo test --test haptic system -- --nocapture` watches the loop for a minute.
+//! `MAILLE_SECONDS=60 cargo test --test haptic system -- --nocapture` watches the loop for a minute, `MAILLE_REST_SECONDS=120 cargo test --test haptic
+//! resting -- --nocapture` a resting hand for two.
 
 #[path = "../services/supervisor/tests/support/mod.rs"]
 #[allow(dead_code)] // shared with other tests, which use other parts
 mod support;
 
+#[path = "haptic/asked.rs"]
+mod asked;
 #[path = "fault_injection/device.rs"]
 mod device;
+#[path = "haptic/resting.rs"]
+mod resting;
 #[path = "haptic/service.rs"]
 mod service;
 
@@ -284,7 +289,8 @@ fn rubbish_from_a_device_is_logged_and_recovered_from_and_no_force_outlives_the_
     let deepest = way.at(0.85).position_mm;
     let say = |at: [f64; 3], measured_ns: u64| {
         let flags = DEVICE_VALID;
-        control.device.store(&DeviceState { measured_ns, flags, position_mm: at, direction: start.direction, velocity_mm_s: [0.0; 3] });
+        let (direction, velocity_mm_s, orientation) = (start.direction, [0.0; 3], [0.0; 4]);
+        control.device.store(&DeviceState { measured_ns, flags, position_mm: at, direction, velocity_mm_s, orientation });
     };
     let mut largest = 0.0f64;
     // presses slowly until the tool is felt, and in what the tool has dented out and in again

@@ -3,18 +3,26 @@
 //! way of the tool between two moves, and most moves would find nothing left.
 //!
 //! What is judged are counts, order and bits: every move that haptic told was taken by the deformation, epochs rise and reach the picture in order, a frame that
-//! began after a commit shows it, the octree that followed commit by commit is that of a fresh build, and one undo brings every bit back. Times and rates are
-//! printed and not judged. `MAILLE_INCISIONS_SECONDS` says how long (4), `MAILLE_INCISIONS_VOLUME` in which head (the made one).
+//! began after a commit shows it, the octree that followed commit by commit is that of a fresh build, so is the one that the run keeps in its region and the
+//! leaves that its commits brought, and one undo brings every bit back. Times and rates are
+//! printed and not judged. `MAILLE_INCISIONS_SECONDS` says how long (4), `MAILLE_INCISIONS_VOLUME` in which head (the made one), `MAILLE_INCISIONS_NO_OCTREE` that
+//! the voxels' own smooth function is felt and no octree kept.
 
 #[path = "neurosurgery/operate.rs"]
 #[allow(dead_code)] // shared with tests that ask for more
 mod operate;
 
-use maille_contract::{Commit, Role, control::Counter, messages::TOOL_IN_CONTACT};
+use maille_contract::{
+    Commit, OctreeHeader, Role,
+    control::Counter,
+    messages::TOOL_IN_CONTACT,
+    octree::{OCTREE_KIND, OCTREE_REGION},
+};
 use maille_phantom::{Kind, Phantom};
 use maille_scene::{BoxMm, Scene};
+use maille_store::{OctreeLeaves, Region};
 use maille_transport::Node;
-use maille_vif::{Octree, Options};
+use maille_vif::{BRICK_LEAVES_BYTES, KeptOctree, LiveOctree, Octree, Options};
 use maille_volume::{
     BrickSource, BrickedVolume, Grid, Rescale, Sampler, Volume,
     brick::EDGE,
@@ -130,6 +138,33 @@ fn follow(octree: &mut Octree, living: &Living, shown: &mut u64) -> usize {
     bricks
 }
 
+/// The octree's region of a run that has one.
+fn rest_octree_region(living: &Living) -> Option<Region<OctreeHeader>> {
+    Region::open(&living.domain, OCTREE_REGION, OCTREE_KIND).ok()
+}
+
+fn open_octree<'a>(region: &'a Region<OctreeHeader>, living: &Living) -> KeptOctree<'a> {
+    KeptOctree::open(&region.body::<u8>()[..region.header().bytes as usize], living.reader.info()).expect("it is the octree of this volume")
+}
+
+/// Compares leaves block by block, bit for bit; how many were compared. A leaf larger than a brick goes on to stand for what of it no commit has touched, where
+/// a fresh build may have others: such blocks are left out unless `all` are asked for.
+fn compare<'l>(live: &LiveOctree<'l, impl Fn(u32) -> Option<&'l [u8; BRICK_LEAVES_BYTES]>>, fresh: &Octree, all: bool) -> usize {
+    let (size, mut count) = (fresh.info().grid.size, 0);
+    for k in (0..size[2]).step_by(8) {
+        for j in (0..size[1]).step_by(8) {
+            for i in (0..size[0]).step_by(8) {
+                let (own, built) = (live.leaf([i, j, k]), fresh.leaf([i, j, k]));
+                if all || (own.0 <= EDGE && built.0 <= EDGE) {
+                    assert!(own == built, "the leaf of the block at {:?} is not that of a fresh build", [i, j, k]);
+                    count += 1;
+                }
+            }
+        }
+    }
+    count
+}
+
 #[test]
 fn a_hundred_incisions_a_second_are_all_taken_felt_seen_in_order_and_taken_back_bit_for_bit() {
     let seconds = std::env::var("MAILLE_INCISIONS_SECONDS").ok().and_then(|s| s.parse().ok()).unwrap_or(4.0);
@@ -160,6 +195,8 @@ fn a_hundred_incisions_a_second_are_all_taken_felt_seen_in_order_and_taken_back_
     // the haptic surface can be another, to see what its ticks take
     let surface = std::env::var("MAILLE_INCISIONS_SURFACE").unwrap_or("smooth".into());
     let rest = rest.replace("surface = \"smooth\"", &format!("surface = {surface:?}"));
+    // so can the function be the voxels' own
+    let rest = if std::env::var_os("MAILLE_INCISIONS_NO_OCTREE").is_some() { rest.replace("octree = true\n", "") } else { rest };
     let text = format!("{head}{tool}{path}[incision]{rest}");
 
     let living = Living::start(&scratch, &text, &["--report", json.to_str().expect("a path")]);
@@ -261,12 +298,30 @@ fn a_hundred_incisions_a_second_are_all_taken_felt_seen_in_order_and_taken_back_
     assert!(octree == fresh, "the octree that followed is not that of a fresh build");
     println!("octree: {refitted} bricks fitted again, {:.2} ms each with their chunks", 1e3 * refit_s / refitted.max(1) as f64);
 
+    // and so are those that the run keeps: its region, and what commits brought for the bricks that they rewrote
+    let region = rest_octree_region(&living);
+    if let Some(region) = &region {
+        let (kept, snapshot) = (open_octree(region, &living), living.reader.snapshot());
+        let leaves = compare(&kept.live(|id| snapshot.channel::<OctreeLeaves>(id)), &fresh, false);
+        let own = (0..snapshot.layout().count() as u32).filter(|&id| snapshot.channel::<OctreeLeaves>(id).is_some()).count();
+        println!(
+            "kept octree: {:.3} of the voxels' bytes; {own} bricks with leaves of their own; {leaves} blocks in leaves up to a brick, all as in a fresh build",
+            region.header().bytes as f64 / (2 * snapshot.info().grid.voxel_count()) as f64
+        );
+        assert!(own > 0 && leaves > 0);
+    }
+
     // taken back: strokes that were not interrupted for half a second are one
     living.undo(30);
     eventually("all is as at rest", || living.is_at_rest());
     follow(&mut octree, &living, &mut followed);
     assert!(octree == Octree::build(&rest, Options::default()).expect("the options are right"), "and so is the octree");
-    drop((frames, commits, node));
+    if let Some(region) = &region {
+        let (kept, snapshot) = (open_octree(region, &living), living.reader.snapshot());
+        let at_rest = Octree::build(&rest, Options::default()).expect("the options are right");
+        compare(&kept.live(|id| snapshot.channel::<OctreeLeaves>(id)), &at_rest, true);
+    }
+    drop((frames, commits, node, region));
     living.end();
 
     let report = report(&json);

@@ -176,6 +176,37 @@ fn a_service_can_be_started_by_hand_where_the_run_leaves_room() {
     assert_eq!(left_over(&domain), [""; 0]);
 }
 
+/// A device's library that is missing, no library, or another's; addresses and CPUs that are none: one sentence, before anything is made. A device that is
+/// merely not plugged in is none of these (`tests/haptic.rs`).
+#[test]
+fn what_a_scene_names_and_this_machine_has_not_is_refused_before_the_run() {
+    let scratch = Scratch::new("run-refused");
+    let text = scratch.write("text.so", "no library at all").display().to_string();
+    for (more, device, says) in [
+        ("[device]\nlibrary = \"/nowhere/libHD.so\"\n".into(), "touch", "there is no library /nowhere/libHD.so"),
+        (format!("[device]\nlibrary = \"{text}\"\n"), "touch", "text.so cannot be opened as a library"),
+        (format!("[device]\nlibrary = \"{text}\"\n"), "forcedimension", "text.so cannot be opened as a library"),
+        // a library that is there, and another one
+        ("[device]\nlibrary = \"libc.so.6\"\n".into(), "touch", "libc.so.6 has no function hdInitDevice"),
+        ("[device]\nlibrary = \"libc.so.6\"\n".into(), "forcedimension", "libc.so.6 has no function dhdGetDeviceCount"),
+        ("[device]\nlibrary = \"libNone.so.9\"\n".into(), "touch", "libHD was not found"),
+        ("[device]\naddress = \"nonsense\"\n".into(), "inverse3", "device.address is no address"),
+        ("[haptic]\ncpu = 1023\n".into(), "path", "haptic.cpu = 1023 is none of the CPUs"),
+    ] {
+        let scene = SMALL_SCENE.replace("[tool]\n", &format!("[tool]\ndevice = \"{device}\"\n")) + &more;
+        let scene = scratch.write("refused.toml", &scene);
+        for command in [&["run", "--headless"][..], &["check", "--no-measure"]] {
+            let output = maille().args(command).arg(&scene).output().unwrap();
+            let [out, said] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes).into_owned());
+            assert_eq!(output.status.code(), Some(1), "{command:?} {more}: {said}");
+            // lines are broken where a terminal would end, also in the midst of a path
+            let flat = |text: &str| text.replace(|c: char| c.is_whitespace() || c == '│', "");
+            assert!(flat(&said).contains(&flat(says)), "{command:?} {more}: {said}");
+            assert!(!out.contains("pid") && !out.contains("domain"), "nothing was started: {out}");
+        }
+    }
+}
+
 #[test]
 fn wrong_use_ends_with_2_and_what_is_refused_with_1_and_a_sentence() {
     let status = |arguments: &[&str]| {

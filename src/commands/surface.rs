@@ -2,7 +2,8 @@
 
 use super::{Failure, Outcome};
 use maille_surface::{
-    Border, Mesh, Organ, ResolutionError, Selection, decimate, marching_cubes_bricks, marching_cubes_patches, marching_cubes_vif, organ,
+    Border, Mesh, Organ, PATCHES_PER_VOXEL, ResolutionError, Selection, decimate, marching_cubes_bricks, marching_cubes_patches,
+    marching_cubes_vif, organ,
 };
 use maille_vif::{Lattice, Octree, Options, Tolerance, Voxels, Window};
 use maille_volume::{BrickSource, BrickedVolume, Volume, io::write_volume};
@@ -57,7 +58,8 @@ pub struct Args {
     /// are; 5, 7 or 9 fit in a window of so many voxels, 1 interpolates without smoothing
     #[arg(long, value_name = "HOW", num_args = 0..=1, default_missing_value = "patch", value_parser = smooth)]
     smooth: Option<Smooth>,
-    /// Lattice points a voxel along each axis, above or below 1
+    /// Lattice points a voxel along each axis, above or below 1; without it 2 with `--smooth` (`patch`), which then is at most half as far from the truth as
+    /// the voxels' surface, and 1 else
     #[arg(long, value_name = "N", value_parser = positive)]
     per_voxel: Option<f64>,
     /// Take the surface from an octree of tri-cubics, each leaf within this RMS of its voxels, instead of the voxels
@@ -189,8 +191,8 @@ fn extract(
     if args.smooth.is_none() && args.per_voxel.is_none() && args.tolerance.is_none() {
         return Ok(marching_cubes_bricks(source, iso, border));
     }
-    let per_voxel = args.per_voxel.unwrap_or(1.0);
     let how = args.smooth.unwrap_or(Smooth::Window(Window::One));
+    let per_voxel = args.per_voxel.unwrap_or(if matches!(how, Smooth::Patch) { PATCHES_PER_VOXEL } else { 1.0 });
     let mesh = match args.tolerance {
         None => how.extract(&Voxels(source), iso, per_voxel, border),
         Some(rms) => {

@@ -57,10 +57,11 @@ pub fn drive(control: &ControlMap, way: &Waypoints, grip: Grip, stop: &AtomicBoo
             position_mm: pose.position_mm,
             direction: pose.direction,
             velocity_mm_s: [0.0; 3],
+            orientation: [0.0; 4],
         };
         control.device.store(&state);
         if let Some(told) = told {
-            let DeviceForce { sent_ns, sequence, incarnation, force_n: told_n } = told;
+            let DeviceForce { sent_ns, sequence, incarnation, force_n: told_n, .. } = told;
             felt.push(Felt { at_ns: now, sent_ns, sequence, incarnation, told_n, felt_n });
         }
     }

@@ -138,17 +138,17 @@ fn cuts(bench: &mut Bench, centers: &[[f64; 3]], window: Window) {
     let mut near = Neighbourhood::new(&bricks, window, 4.0).expect("four bricks are enough");
     let mut carved = Vec::new();
     for (epoch, &center) in (1u64..).zip(centers) {
-        near.follow(&bricks, epoch, center);
+        near.follow(&Voxels(&bricks), &bricks, epoch, center);
         let tool = if epoch % 2 == 0 { Tool::Ball { radius_mm: 3.2 } } else { Tool::Box([4; 3]) };
         let Some(incision) = Incision::new(&bricks.info().grid, tool, center) else { continue };
         let (low, high) = incision.bounds();
         carved.push(carve(&mut bricks, &incision, -1000.0));
         octree.refit(&bricks, low, high);
         // bricks on the heap have no versions of their own: a tool elsewhere and back is what makes it look again
-        near.follow(&bricks, epoch, center.map(|v| v + 20.0));
-        near.follow(&bricks, epoch + 1, center);
+        near.follow(&Voxels(&bricks), &bricks, epoch, center.map(|v| v + 20.0));
+        near.follow(&Voxels(&bricks), &bricks, epoch + 1, center);
         let mut fresh = Neighbourhood::new(&bricks, window, 4.0).expect("as before");
-        fresh.follow(&bricks, epoch, center);
+        fresh.follow(&Voxels(&bricks), &bricks, epoch, center);
         for at in [center, center.map(|v| v + 0.7), center.map(|v| v - 1.2)] {
             let (a, b) = (near.spline().value(at), fresh.spline().value(at));
             bench.worst[5] += f64::from(u8::from(a.map(f64::to_bits) != b.map(f64::to_bits)));

@@ -14,6 +14,7 @@
 mod announce;
 mod drag;
 mod incise;
+mod octree;
 #[cfg(test)]
 mod recovery;
 mod restore;
@@ -76,9 +77,10 @@ pub fn run(domain: &str) -> Result<(), DeformationError> {
     }
     let plan = maille_scene::plan(&scene, &reader.info().grid, Machine { cores: 1 });
     let (stages, can_switch) = (plan.stage_names(Process::Deformation), plan.can_switch(Process::Deformation));
+    let leaves = octree::Leaves::open(&domain, &scene, &writer)?;
     match timed(&domain, &life, Role::Deformation, stages)? {
-        Some(watch) => steps(&scene, life, &moves, announcer, writer, &reader, can_switch, watch),
-        None => steps(&scene, life, &moves, announcer, writer, &reader, can_switch, Untimed),
+        Some(watch) => steps(&scene, life, &moves, announcer, writer, leaves, &reader, can_switch, watch),
+        None => steps(&scene, life, &moves, announcer, writer, leaves, &reader, can_switch, Untimed),
     }
     Ok(())
 }
@@ -91,11 +93,13 @@ fn steps<W: Stopwatch>(
     moves: &Subscriber<ToolMove>,
     mut announcer: announce::Announcer,
     mut writer: Writer,
+    leaves: Option<octree::Leaves>,
     reader: &Reader,
     can_switch: bool,
     watch: W,
 ) {
     let mut engine = step::Engine::new(scene, reader.info(), watch);
+    engine.octree = leaves;
     let mut drag = drag::Drag::new(scene);
     restore::restore(&mut engine, &writer);
     life.ready();

@@ -11,6 +11,7 @@
 
 use crate::{
     incise::{Changed, Incisions, Strokes},
+    octree::Leaves,
     state::{State, VERSION},
 };
 use maille_chainmail::{
@@ -61,6 +62,8 @@ pub(crate) struct Engine<W> {
     pub moved: BTreeSet<BrickId>,
     /// where the scene's tool takes tissue away
     pub incisions: Option<Incisions>,
+    /// where an octree is kept beside the voxels
+    pub octree: Option<Leaves>,
 }
 
 /// How tissue goes back.
@@ -164,6 +167,7 @@ impl<W: Stopwatch> Engine<W> {
             edge: None,
             moved: BTreeSet::new(),
             incisions: Incisions::new(scene),
+            octree: None,
         }
     }
 
@@ -380,6 +384,10 @@ impl<W: Stopwatch> Engine<W> {
         let mut transaction = writer.begin();
         let mapped = self.mapper.remap(&reader.rest(), &self.mail, region, &mut Sink(&mut transaction), &self.map);
         self.watch.split("mapper");
+        if let Some(octree) = &mut self.octree {
+            octree.follow(&mapped.bricks, reader, &mut transaction);
+            self.watch.split("octree");
+        }
         let bricks: BTreeSet<BrickId> = region.ids().chain(numbered.iter().copied()).collect();
         self.commit_elements(&bricks, &mut transaction);
         self.state.write(transaction.state_mut());

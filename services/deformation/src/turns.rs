@@ -1,6 +1,6 @@
 //! The engine's steps one by one, without its queue and its pauses: for measuring what a step takes.
 
-use crate::{DeformationError, RELAX_NS, drag::Drag, restore, step::Engine};
+use crate::{DeformationError, RELAX_NS, drag::Drag, octree, restore, step::Engine};
 use maille_contract::{Role, Switches, ToolMove};
 use maille_scene::Scene;
 use maille_store::{Reader, Writer};
@@ -23,6 +23,7 @@ impl Turns {
     pub fn open(domain: &Domain, scene: &Scene) -> Result<Self, DeformationError> {
         let (writer, reader) = (Writer::open(domain)?, Reader::open(domain, Role::Deformation)?);
         let mut engine = Engine::new(scene, reader.info(), Untimed);
+        engine.octree = octree::Leaves::open(domain, scene, &writer)?;
         restore::restore(&mut engine, &writer);
         Ok(Self { engine, drag: Drag::new(scene), control: ControlMap::open(domain)?, writer, reader })
     }

@@ -14,20 +14,23 @@ pub(crate) fn kind(tool: &Tool) -> Option<Kind> {
     }
 }
 
-/// How to find and use it.
-pub(crate) fn options(scene: &Scene) -> Result<Options, HapticError> {
+/// How to find and use it; a kind that is none is a device in another process, which stands as its owner says.
+pub(crate) fn options(scene: &Scene, kind: Option<Kind>) -> Result<Options, HapticError> {
     let d = &scene.device;
     let named = |name: &String| {
         let known = || profiles::ALL.map(|p| p.name).join(", ");
         profiles::named(name).ok_or_else(|| HapticError::Scene(format!("there is no device profile `{name}`; there are {}", known())))
     };
     let usual = Options::default();
-    let front = Mounting::in_front_of_patient(d.origin_mm.unwrap_or_default());
+    let origin_mm = d.origin_mm.unwrap_or_default();
+    let front = kind.map_or(Mounting { origin_mm, ..Mounting::default() }, |kind| Mounting::in_front_of_patient(kind, origin_mm));
     Ok(Options {
         address: d.address.clone().unwrap_or(usual.address),
         library: d.library.clone(),
         device: d.id.clone(),
         mounting: Mounting { rotation: d.rotation.unwrap_or(front.rotation), scale: d.scale.unwrap_or(1.0), ..front },
+        // below the tick, above all else
+        priority: (i32::try_from(scene.haptic.priority.min(99)).unwrap_or(99) - 1).max(0),
         profile: d.profile.as_ref().map(named).transpose()?,
         ..usual
     })
@@ -45,6 +48,17 @@ pub(crate) fn open(kind: Kind, mut options: Options, scene: &Scene, way: &Waypoi
 mod tests {
     use super::*;
 
+    /// Without a rotation in the scene each device stands as its maker's axes say: a hand that goes down goes into a patient on the back.
+    #[test]
+    fn a_scene_that_says_nothing_of_axes_has_each_device_upright() {
+        let scene = Scene::builtin_default();
+        for (kind, down) in [(Kind::Touch, [0.0, -5.0, 0.0]), (Kind::ForceDimension, [0.0, 0.0, -5.0]), (Kind::Inverse3, [0.0, 0.0, -5.0])]
+        {
+            let mounting = options(&scene, Some(kind)).unwrap().mounting;
+            assert_eq!(mounting.place(down).map(|c| c + 0.0), [0.0, 5.0, 0.0], "{kind:?}");
+        }
+    }
+
     #[test]
     fn what_scenes_call_devices_is_what_devices_are_called() {
         for (device, name) in RealDevice::ALL {
@@ -54,8 +68,8 @@ mod tests {
         assert_eq!(maille_scene::PROFILES, profiles::ALL.map(|p| p.name));
         let mut scene = Scene::builtin_default();
         scene.device.profile = Some("touch".into());
-        assert_eq!(options(&scene).unwrap().profile, Some(profiles::TOUCH));
+        assert_eq!(options(&scene, None).unwrap().profile, Some(profiles::TOUCH));
         scene.device.profile = Some("feather".into());
-        assert!(options(&scene).is_err());
+        assert!(options(&scene, None).is_err());
     }
 }

@@ -11,6 +11,7 @@
 
 mod breath;
 mod device;
+mod kept;
 mod needle;
 mod needle_port;
 mod operator;
@@ -27,7 +28,11 @@ use maille_realtime::{Period, enter_realtime, lock_memory, monotonic_ns, prefaul
 use maille_scene::{Machine, Process, Scene};
 use maille_store::Reader;
 use maille_transport::{Domain, Life, Stopwatch, Untimed, timed};
-use std::sync::Arc;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, Ordering::Relaxed},
+};
 use thiserror::Error;
 
 /// Why the haptic process could not start.
@@ -48,6 +53,8 @@ pub enum HapticError {
     Device(#[from] maille_device::DeviceError),
     #[error("the thread that publishes poses could not start: {0}")]
     Thread(std::io::Error),
+    #[error("signals cannot be received: {0}")]
+    Signals(std::io::Error),
 }
 
 /// Longest time given to the force to fade when the run ends [ns]: whatever the scene's fade, on leaving it is 0.25 s at most and as fast as 0.1 N a
@@ -72,12 +79,17 @@ pub fn run(domain: &str) -> Result<(), HapticError> {
 
 /// Sets the loop up and runs it.
 fn serve<W: Stopwatch>(domain: &Domain, mut life: Life, scene: &Scene, reader: &Reader, watch: W) -> Result<(), HapticError> {
+    let asked_to_end = end_by_signal().map_err(HapticError::Signals)?;
     let outbox = Arc::new(outbox::Outbox::new());
     let publisher = publisher::start(domain, scene, Arc::clone(&outbox), life.incarnation())?;
     // nothing is mapped, and nothing of it runs, in a scene that does not breathe
     let mut regions = maille_breathing::Regions::open(domain, scene)?;
     let patient = regions.as_mut().map(maille_breathing::Regions::patient).transpose()?;
+    // nor one where no octree is kept
+    let kept = kept::Kept::open(domain, scene)?;
+    let octree = kept.as_ref().map(|kept| kept.octree(reader.info())).transpose()?;
     let mut tick = tick::Loop::new(domain, scene, reader, patient, outbox, publisher.thread().clone(), watch)?;
+    tick.feel(octree.as_ref());
 
     let notices = enter_realtime(scene.haptic.priority.min(99) as i32, scene.haptic.cpu);
     for notice in notices.iter().map(ToString::to_string).chain(lock_memory().map(|n| n.to_string())) {
@@ -90,20 +102,30 @@ fn serve<W: Stopwatch>(domain: &Domain, mut life: Life, scene: &Scene, reader: &
     // pages of the tissue come beside the loop: until then a first touch costs a tick a microsecond, waiting for all would cost the hand 0.1 s a GiB
     std::thread::scope(|scope| {
         scope.spawn(|| reader.prefault());
-        ticks(scene, &mut life, &mut tick);
+        ticks(scene, &mut life, &mut tick, &asked_to_end);
     });
     publisher.stop();
     Ok(())
 }
 
-/// The loop itself, until the run ends and the force has faded.
-fn ticks<W: Stopwatch>(scene: &Scene, life: &mut Life, tick: &mut tick::Loop<'_, W>) {
+/// Signals that ask a process to end only set a flag here, so that a hand is let go by a fade first: Ctrl-C where the service was started by hand, the
+/// end of a session, a shutdown.
+fn end_by_signal() -> std::io::Result<Arc<AtomicBool>> {
+    let asked = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM, SIGHUP, SIGQUIT] {
+        signal_hook::flag::register(signal, Arc::clone(&asked))?;
+    }
+    Ok(asked)
+}
+
+/// The loop itself, until the run ends or a signal asks for it, and the force has faded.
+fn ticks<W: Stopwatch>(scene: &Scene, life: &mut Life, tick: &mut tick::Loop<'_, W>, asked_to_end: &AtomicBool) {
     let mut period = Period::new(scene.haptic.rate_hz);
     let mut leaving_since = None;
     loop {
         let released = period.wait();
         let began = monotonic_ns();
-        if !life.beat(began) && leaving_since.is_none() {
+        if (!life.beat(began) || asked_to_end.load(Relaxed)) && leaving_since.is_none() {
             leaving_since = Some(began);
         }
         let (force_n, allocations) = steady(|| tick.run(life, began, leaving_since.is_some()));

@@ -9,7 +9,7 @@
 
 use maille_contact::{ConsoleDevice, Device as _, DevicePose, DeviceProfile, Grip, SimulatedHand};
 use maille_contract::ToolCommand;
-use maille_contract::messages::{DEVICE_KNOWS_VELOCITY, DEVICE_VALID, DeviceState};
+use maille_contract::messages::{DEVICE_KNOWS_ORIENTATION, DEVICE_KNOWS_VELOCITY, DEVICE_VALID, DeviceState};
 use maille_device::RemoteDevice;
 use maille_scene::{Device, Hand, Tool, Waypoints};
 
@@ -45,6 +45,8 @@ pub(crate) struct Operator {
     /// when a device in another process measured last [ns], and how often that went backwards
     measured_ns: u64,
     backwards: u64,
+    /// how a device in another process is turned, where it knows
+    turned: Option<[f64; 4]>,
 }
 
 impl Operator {
@@ -61,12 +63,27 @@ impl Operator {
             (Device::External, _) => Holder::External,
             _ => Holder::Script,
         };
-        Self { way, holder, page: None, back: None, pose, follow_script: tool.device != Device::Console, measured_ns: 0, backwards: 0 }
+        Self {
+            way,
+            holder,
+            page: None,
+            back: None,
+            pose,
+            follow_script: tool.device != Device::Console,
+            measured_ns: 0,
+            backwards: 0,
+            turned: None,
+        }
     }
 
     /// Whether a device in another process is held.
     pub fn is_external(&self) -> bool {
         matches!(self.holder, Holder::External)
+    }
+
+    /// Exchanges with a real device so far, late ones among them, and times that it was opened.
+    pub fn exchanges(&self) -> Option<[u64; 3]> {
+        if let Holder::Real(device) = &self.holder { Some([device.exchanges(), device.late(), device.opened()]) } else { None }
     }
 
     /// How often the clock of a device in another process went backwards since the last call.
@@ -79,9 +96,14 @@ impl Operator {
         !self.follow_script && self.page.is_none() && matches!(self.holder, Holder::Script)
     }
 
+    /// What part of the force written now the device gives.
+    pub fn gives(&self) -> f64 {
+        if let Holder::Real(device) = &self.holder { device.gives() } else { 1.0 }
+    }
+
     /// Orientation of the tool, where a device knows it.
     pub fn orientation(&self) -> Option<[f64; 4]> {
-        if let Holder::Real(device) = &self.holder { device.orientation() } else { None }
+        if let Holder::Real(device) = &self.holder { device.orientation() } else { self.turned }
     }
 
     /// The pose and its age [s]; see [`Self::read`]. `said` is the word of a device in another process.
@@ -109,6 +131,7 @@ impl Operator {
         };
         self.backwards += u64::from(said.measured_ns < std::mem::replace(&mut self.measured_ns, said.measured_ns));
         // what was measured later than now has no age: it would never grow stale
+        self.turned = (said.flags & DEVICE_KNOWS_ORIENTATION != 0).then_some(said.orientation);
         let from_the_future = said.measured_ns > monotonic_ns.saturating_add(AHEAD_NS);
         self.pose = DevicePose {
             position_mm: said.position_mm,

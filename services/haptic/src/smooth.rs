@@ -8,12 +8,12 @@
 //! With `haptic.surface = "patch"` the normal is that of the bi-cubic patch around the last foot [Shimizu & Nakamura, eq. 6 to 8]. It is blended into the
 //! function's own over the outer half of the patch's reach; where no patch is found the function's own normal is felt, and that is counted.
 //!
-//! Units: mm, HU; reference space. Cost: 0.06 µs a sample, 7 to 10 µs a load, 5 µs a patch (`--example continuity` of `maille-vif`). Allocation: none after `new`.
+//! Units: mm, HU; reference space. Cost: 0.06 µs a sample, 5 to 10 µs a load, 5 µs a patch (`--example continuity` of `maille-vif`). Allocation: none after `new`.
 
 use crate::HapticError;
 use maille_contact::{Isosurface, Surface, TickOutputs};
 use maille_scene::{Scene, TouchedSurface};
-use maille_vif::{LocalSurface, Neighbourhood, Window};
+use maille_vif::{Lattice, LocalSurface, Neighbourhood, Window};
 use maille_volume::{BrickSource, Grid, VolumeSample};
 use nalgebra::{Matrix3, Vector3};
 
@@ -62,10 +62,10 @@ impl SmoothStage {
         }))
     }
 
-    /// Makes ready what is felt with the tip's centre at `tip_mm`.
-    pub fn prepare(&mut self, source: &impl BrickSource, epoch: u64, tip_mm: [f64; 3], threshold_hu: f64) {
+    /// Makes ready what is felt with the tip's centre at `tip_mm`, out of a lattice that changes only with bricks of the source.
+    pub fn prepare(&mut self, lattice: &impl Lattice, source: &impl BrickSource, epoch: u64, tip_mm: [f64; 3], threshold_hu: f64) {
         let around = self.foot.filter(|(_, deep)| *deep).map_or(tip_mm, |(foot, _)| foot);
-        self.tally.0 += u64::from(self.near.follow(source, epoch, self.grid.index_from_world(around)));
+        self.tally.0 += u64::from(self.near.follow(lattice, source, epoch, self.grid.index_from_world(around)));
         self.patch = None;
         if let (true, Some((foot, _))) = (self.patched, self.foot) {
             let (foot, step) = (self.grid.index_from_world(foot), PATCH_STEP * self.grid.min_spacing());
@@ -146,6 +146,7 @@ impl<S: BrickSource> Surface for SmoothSurface<'_, S> {
 mod tests {
     use super::*;
     use maille_contact::{Proxy, Touch};
+    use maille_vif::Voxels;
     use maille_volume::{BrickedVolume, Rescale, Volume};
 
     /// A ball of 20 mm imaged with a blurred edge, 1 000 HU, with noise or without.
@@ -188,7 +189,7 @@ mod tests {
             let at: [f64; 3] = (direction * height).into();
             let touch = match &mut stage {
                 Some(stage) => {
-                    stage.prepare(&bricks, 1, at, -500.0);
+                    stage.prepare(&Voxels(&bricks), &bricks, 1, at, -500.0);
                     proxy.update(&stage.surface(&bricks, -500.0), at)
                 }
                 None => proxy.update(&Isosurface::new(&bricks, -500.0), at),

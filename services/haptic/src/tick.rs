@@ -9,8 +9,9 @@ use maille_contract::control::{Counter, HEARTBEAT_LATE_NS};
 use maille_contract::messages::{DeviceForce, TOOL_FADING, TOOL_IN_CONTACT, TOOL_TAKEN_OVER, TOOL_TISSUE_STANDS};
 use maille_contract::{ControlBlock, Role, ServiceState, Stamp, ToolCommand, ToolMove, ToolState, ViewState};
 use maille_scene::{BoxMm, Device, Scene};
-use maille_store::Reader;
+use maille_store::{OctreeLeaves, Reader};
 use maille_transport::{Domain, Life, Stopwatch};
+use maille_vif::{KeptOctree, Voxels};
 use maille_volume::Sampler;
 use std::{sync::Arc, sync::atomic::Ordering::Relaxed, thread::Thread};
 
@@ -25,6 +26,8 @@ pub(crate) struct Loop<'a, W> {
     needle: Option<NeedleStage>,
     /// in a scene whose smooth surface is felt
     smooth: Option<SmoothStage>,
+    /// the octree that it is of, where one is kept; else it is of the voxels
+    octree: Option<&'a KeptOctree<'a>>,
     /// in a scene that breathes
     breather: Option<Breather<'a>>,
     threshold_hu: f64,
@@ -37,12 +40,16 @@ pub(crate) struct Loop<'a, W> {
     last: Option<TickOutputs>,
     /// faults that others know of
     told: Faults,
+    /// exchanges with a real device that others know of
+    exchanges: [u64; 3],
     /// the process that moves tissue is dead, starting, or silent
     tissue_stands: bool,
     refused: u64,
     /// what the last tick's inversion left [mm]; none where none was asked for, or none was found
     residual_mm: Option<f64>,
     unmapped: bool,
+    /// millimetres of the patient for one of a device's, whose lever is so much longer
+    scale: f64,
 }
 
 impl<'a, W: Stopwatch> Loop<'a, W> {
@@ -57,12 +64,12 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         watch: W,
     ) -> Result<Self, HapticError> {
         let tool = scene.tool.as_ref().ok_or(HapticError::NoTool)?;
-        let real = device::kind(tool).map(|kind| device::options(scene).map(|options| (kind, options))).transpose()?;
+        let real = device::kind(tool).map(|kind| device::options(scene, Some(kind)).map(|options| (kind, options))).transpose()?;
         let profile = match (&tool.device, &real) {
             (_, Some((kind, options))) => Some(maille_device::profile(*kind, options)),
             (Device::Sim, None) => Some(simulated_profile(&tool.hand, scene.haptic.max_force_n, scene.haptic.rate_hz)),
             // its owner says what it is, or guards the port itself
-            (Device::External, None) => device::options(scene)?.profile,
+            (Device::External, None) => device::options(scene, None)?.profile,
             _ => None,
         };
         let (config, lowered) = setup::config(scene, tool, profile.as_ref()).map_err(|e| HapticError::Scene(e.to_string()))?;
@@ -73,6 +80,8 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
                 config.coupling.damping_n_s_per_mm()
             );
         }
+        let scale = if setup::is_scaled(&tool.device) { scene.device.scale.unwrap_or(1.0) } else { 1.0 };
+        let is_device = real.is_some() || tool.device == Device::External;
         let rest = reader.rest();
         let sampler = Sampler::new(&rest);
         let way =
@@ -85,12 +94,14 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             &reader.info().grid,
             config.limits,
             profile.as_ref(),
-            real.as_ref().and(profile.as_ref()).map(|p| p.max_torque_n_mm),
+            // a device that says nothing of itself gets none
+            is_device.then(|| profile.as_ref().map_or(0.0, |p| p.max_torque_n_mm * scale)),
         )?;
         Ok(Self {
             watch,
             reader,
             smooth: SmoothStage::new(scene, &rest, config.radius_mm)?,
+            octree: None,
             needle,
             core: HapticCore::new(config),
             operator: Operator::new(tool, scene.haptic.rate_hz, way, real),
@@ -104,11 +115,18 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
             publisher,
             last: None,
             told: Faults::default(),
+            exchanges: [0; 3],
             tissue_stands: false,
             refused: 0,
             residual_mm: None,
             unmapped: false,
+            scale,
         })
+    }
+
+    /// From now on the smooth surface is that of an octree and of the leaves that commits brought.
+    pub fn feel(&mut self, octree: Option<&'a KeptOctree<'a>>) {
+        self.octree = octree;
     }
 
     /// Goes on from where a haptic process that died left the tip, so that tissue which the tip is still in is felt from the wall it came
@@ -142,6 +160,7 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         if let Some(orientation) = orientation {
             self.core.set_orientation(orientation);
         }
+        self.core.set_given(self.operator.gives());
         let snapshot = self.reader.snapshot();
         let epoch = snapshot.epoch();
         // tissue stands as it was committed while its owner is silent: it is felt, and said
@@ -152,7 +171,13 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         let moving = moment.as_mut().map(|moment| moment as &mut dyn MovingTissue);
         let mut out = match &mut self.smooth {
             Some(smooth) => {
-                smooth.prepare(&snapshot, epoch, pose.position_mm, threshold_hu);
+                match self.octree {
+                    Some(octree) => {
+                        let octree = octree.live(|id| snapshot.channel::<OctreeLeaves>(id));
+                        smooth.prepare(&octree, &snapshot, epoch, pose.position_mm, threshold_hu);
+                    }
+                    None => smooth.prepare(&Voxels(&snapshot), &snapshot, epoch, pose.position_mm, threshold_hu),
+                }
                 let surface = smooth.surface(&snapshot, threshold_hu);
                 let inputs = TickInputs { now_ns, pose, pose_age_s, tissue: Some(&surface), epoch, tissue_age_s, release };
                 let out = self.core.tick_in(&inputs, moving);
@@ -219,7 +244,8 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         self.ticks += 1;
         if self.operator.is_external() {
             let (sequence, incarnation) = (self.ticks, life.incarnation());
-            life.control().device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence, incarnation, force_n: out.force_n });
+            let (force_n, torque_n_mm) = (out.force_n, out.torque_n_mm.map(|t| t / self.scale));
+            life.control().device_force.store(&DeviceForce { sent_ns: monotonic_ns, sequence, incarnation, force_n, torque_n_mm });
         }
     }
 
@@ -323,6 +349,12 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
                 (Counter::AbsurdForces, now.absurd_forces, told.absurd_forces),
             ] {
                 cell.count(counter, now.saturating_sub(told));
+            }
+        }
+        if let Some(now) = self.operator.exchanges() {
+            let told = std::mem::replace(&mut self.exchanges, now);
+            for (n, counter) in [Counter::DeviceExchanges, Counter::DeviceLate, Counter::DeviceOpened].into_iter().enumerate() {
+                cell.count(counter, now[n].saturating_sub(told[n]));
             }
         }
         cell.count(Counter::TimeBackwards, self.operator.took_backwards());

@@ -1,8 +1,8 @@
 //! The warp of a frame: where the patient who breathes lies at the frame's simulation time.
 //!
 //! The mapped fields are summed up where they lie, for the moment, and the ray caster's lattice is inverted from that sum, warm from the last frame's. The lattice is as
-//! coarse as the scene's tolerance allows at the ends of usual breathing, found once at the start; how far from
-//! its place anything may be drawn goes to the report for every frame.
+//! coarse as the scene's tolerance allows at the ends of usual breathing, found once at the start; where none that is tried suffices, as with a registration's fields,
+//! a coarse one leads, and samples are found one by one in the sum itself. How far from its place anything may be drawn goes to the report for every frame.
 
 use maille_breathing::Patient;
 use maille_contract::ControlBlock;
@@ -12,6 +12,8 @@ use maille_volume::VolumeInfo;
 
 /// Distances of the lattice's nodes that are tried, coarsest first [mm].
 const PITCHES_MM: [f32; 8] = [16.0, 12.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.5];
+/// Distance of nodes where no lattice suffices and they only lead samples to where they are found one by one [mm].
+const LEADING_MM: f32 = 8.0;
 /// No finer lattice than this [nodes]: 64 MiB.
 const MOST_NODES: f64 = 4e6;
 
@@ -25,7 +27,7 @@ pub(crate) struct Breather<'a> {
     report: WarpReport,
     /// what a picture's own lattice may add [mm]: half of the warp's tolerance
     view_mm: f32,
-    /// lattices that were tried, coarsest first: distance of nodes, and how far from its place anything was drawn by it [mm]
+    /// lattices that were tried, coarsest first: distance of nodes, and how far from its place anything was drawn by it alone [mm]
     tried: Vec<(f32, f32)>,
 }
 
@@ -36,7 +38,7 @@ impl<'a> Breather<'a> {
         let nodes = |pitch: f32| (0..3).map(|c| extent(c) / f64::from(pitch) + 4.0).product::<f64>();
         // a picture's own lattice takes half of what it is given: a third of the whole, as the patient's share is the dearer
         let within_mm = 0.66 * tolerance_mm as f32;
-        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm };
+        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm, ..WarpOptions::default() };
         let collapsed = Collapsed::new(patient.model(), tolerance_mm as f32);
         let warp = Warp::new(info, options(PITCHES_MM[0]));
         let (report, view_mm) = (WarpReport::default(), 0.5 * within_mm);
@@ -48,22 +50,23 @@ impl<'a> Breather<'a> {
             breather.warp = Warp::new(info, options(pitch));
             // both ends of a breath; deepest first, so that the lattice has room for all that follows
             let usual = [Breath { level: 1.0, rate: 0.0, phase: 0.0 }, Breath::EXPIRED, Breath { level: 0.5, rate: -0.8, phase: 0.25 }];
-            let worst = usual.map(|breath| drawn_off_mm(&breather.bend(breath), breather.view_mm)).into_iter().fold(0.0, f32::max);
-            breather.tried.push((pitch, worst - breather.view_mm));
-            if f64::from(worst) <= tolerance_mm {
-                break;
+            let worst = usual.map(|breath| breather.bend(breath).lattice_mm).into_iter().fold(0.0, f32::max);
+            breather.tried.push((pitch, worst));
+            if f64::from(worst + breather.view_mm) <= tolerance_mm {
+                return breather;
             }
         }
+        breather.warp = Warp::new(info, options(LEADING_MM));
         breather
     }
 
-    /// Another tolerance [mm], no finer than the one that it was made for: the coarsest lattice of those tried that keeps within it.
+    /// Another tolerance [mm], no finer than the one that it was made for: the coarsest lattice of those tried that keeps within it, or the one that only leads.
     pub fn set_tolerance(&mut self, tolerance_mm: f64) {
         let within_mm = 0.66 * tolerance_mm as f32;
         self.view_mm = 0.5 * within_mm;
         let fits = |(_, off_mm): &&(f32, f32)| f64::from(off_mm + self.view_mm) <= tolerance_mm;
-        let Some(&(pitch_mm, _)) = self.tried.iter().find(fits).or(self.tried.last()) else { return };
-        self.warp = Warp::new(&self.info, WarpOptions { tolerance_mm: within_mm, pitch_mm });
+        let pitch_mm = self.tried.iter().find(fits).map_or(LEADING_MM, |(pitch_mm, _)| *pitch_mm);
+        self.warp = Warp::new(&self.info, WarpOptions { tolerance_mm: within_mm, pitch_mm, ..WarpOptions::default() });
         self.collapsed = Collapsed::new(self.patient.model(), tolerance_mm as f32);
     }
 
@@ -98,7 +101,7 @@ impl<'a> Breather<'a> {
 }
 
 /// How far from where it is anything is drawn [mm]: what is shown at x is X, whose place is X + u(X). That is the residual itself, at its worst in the
-/// middle of the lattice's cells, and what the picture's own lattice adds; whatever the contraction, by which the report bounds the error in X.
+/// middle of the lattice's cells or, in rough ones, where a sample counts as found, and what the picture's own lattice adds; whatever the contraction, by which the report bounds the error in X.
 fn drawn_off_mm(report: &WarpReport, view_mm: f32) -> f32 {
     report.error_mm * (1.0 - report.contraction.clamp(0.01, 0.95)) + view_mm
 }

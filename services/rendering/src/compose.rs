@@ -154,7 +154,13 @@ impl Composer {
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
-            let overlay = Overlay { warp, labels: self.labels.as_ref(), displacement_mm: self.overlay_mm, geometry: Some(&bodies) };
+            let overlay = Overlay {
+                warp,
+                labels: self.labels.as_ref(),
+                displacement_mm: self.overlay_mm,
+                geometry: Some(&bodies),
+                ..Overlay::default()
+            };
             self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
         watch.split("sections");

@@ -29,8 +29,9 @@ pub mod labels;
 pub mod memory;
 pub mod needle;
 mod needle_plot;
+pub mod octree;
 mod output;
-mod patient;
+pub mod patient;
 mod process;
 pub mod recording;
 pub mod report;
@@ -51,7 +52,7 @@ use fronts::Fronts;
 use maille_contract::Role;
 use maille_scene::{Device, Scene};
 use signals::Signals;
-use simulation::Simulation;
+use simulation::{Ready, Simulation};
 use std::{
     fs,
     path::{Path, PathBuf},
@@ -69,6 +70,9 @@ pub(crate) use say;
 
 /// How long the end of a run waits for somebody to read what it says.
 const LAST_WORDS: Duration = Duration::from_millis(500);
+
+/// See [`RunOptions::vet`].
+pub type Vet = fn(&Scene) -> Result<(), String>;
 
 /// What to run and how.
 #[derive(Clone, Debug, Default)]
@@ -95,6 +99,8 @@ pub struct RunOptions {
     pub stages: bool,
     /// measured fronts for `accuracy = "auto"`, in place of those that come with the program
     pub fronts: Option<PathBuf>,
+    /// looks whether this machine has what a scene names, before anything is made; why not, in one sentence
+    pub vet: Option<Vet>,
 }
 
 /// Runs a scene to its end: duration, SIGINT, SIGTERM, SIGHUP, or a service that cannot live. Main thread only: the kernel ends
@@ -117,6 +123,9 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     if let Some(motion) = &options.motion {
         scene.use_motion(motion.clone())?;
     }
+    if let Some(vet) = options.vet {
+        vet(&scene).map_err(SupervisorError::Refused)?;
+    }
     scene.console.enabled &= !options.headless;
     let fronts = Fronts::open(options.fronts.as_deref())?;
     for removed in stale::clean_dead_runs()? {
@@ -129,16 +138,22 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
         Some(patient) => patient::breath(&scene, &patient.0.info.grid, &mut signals)?.map(|breath| (patient, breath)),
         None => None,
     };
-    let Some((patient, breath)) = loaded else {
+    let loaded = match loaded {
+        Some((patient, breath)) => {
+            octree::build(&scene, patient, &mut signals)?.map(|(patient, octree)| (patient, Ready { breath, octree }))
+        }
+        None => None,
+    };
+    let Some((patient, ready)) = loaded else {
         let ended_by = signals.received().unwrap_or("signal").to_owned();
         return finish(RunReport { ended_by, ..names }, options);
     };
     for notice in &patient.1 {
         eprintln!("maille: {notice}");
     }
-    let mut simulation = Simulation::create(scene, &patient, breath.as_ref(), &options.by_hand)?;
+    let mut simulation = Simulation::create(scene, &patient, &ready, &options.by_hand)?;
     say!("domain       {}", simulation.domain());
-    drop((patient, breath));
+    drop((patient, ready));
 
     simulation.control.timed.store(u64::from(options.stages), Relaxed);
     simulation.begin();

@@ -11,6 +11,10 @@ use maille_volume::{Grid, Volume, io};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use std::{
     io::IsTerminal as _,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering::Relaxed},
+    },
     time::{Duration, Instant},
 };
 
@@ -71,7 +75,7 @@ pub fn load(source: &VolumeSource, signals: &mut Signals) -> Result<Option<Patie
         VolumeSource::Phantom { kind, size, .. } => format!("making the {} of {} × {} × {} voxels", word(*kind), size[0], size[1], size[2]),
     };
     let source = source.clone();
-    beside(what, signals, move || make(&source))
+    beside(what, signals, None, move || make(&source))
 }
 
 /// What the patient needs to breathe, and nothing where the scene does not call for it; `None` when a signal came first.
@@ -81,13 +85,29 @@ pub fn breath(scene: &Scene, grid: &Grid, signals: &mut Signals) -> Result<Optio
         return Ok(Some(None));
     }
     let (scene, grid) = (scene.clone(), grid.clone());
-    beside("making the fields of breathing".into(), signals, move || Ok(maille_breathing::prepare(&scene, &grid)?))
+    beside("making the fields of breathing".into(), signals, None, move || Ok(maille_breathing::prepare(&scene, &grid)?))
+}
+
+/// The done part of some work, told from any thread.
+#[derive(Clone, Default)]
+pub struct Part(Arc<AtomicU32>);
+
+impl Part {
+    /// So much of it is done, 0 to 1.
+    pub fn set(&self, part: f64) {
+        self.0.store((part * 1e6) as u32, Relaxed);
+    }
+
+    fn get(&self) -> f64 {
+        f64::from(self.0.load(Relaxed)) * 1e-6
+    }
 }
 
 /// Does work on a thread of its own, with progress; `None` when a signal came first.
-fn beside<T: Send + 'static>(
+pub(crate) fn beside<T: Send + 'static>(
     what: String,
     signals: &mut Signals,
+    part: Option<Part>,
     work: impl FnOnce() -> Result<T, SupervisorError> + Send + 'static,
 ) -> Result<Option<T>, SupervisorError> {
     let work = std::thread::Builder::new().name("maille-load".into()).spawn(work);
@@ -100,7 +120,7 @@ fn beside<T: Send + 'static>(
         let moment = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
         let _ = poll(&mut [PollFd::from_borrowed_fd(signals.fd(), PollFlags::IN)], Some(&moment));
         signals.drain();
-        progress.tick(None);
+        progress.tick(part.as_ref().map(Part::get));
     }
     drop(progress);
     match work.join() {

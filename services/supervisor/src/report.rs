@@ -21,6 +21,7 @@
 //! | `services.haptic.ticks`, `contact_share` | ticks after warm-up; part of them in contact |
 //! | `services.haptic.in_contact`, `degraded`, `tissue_stood`, `allocations`, `realtime` | ticks in contact; ticks with the force fading; ticks on tissue as last committed while deformation was away; allocations in ticks; whether real-time rights were had |
 //! | `services.haptic.faults` | what the contact counted, each with its declared answer: `jumps`, `invalid_poses`, `stale_poses`, `time_backwards`, `pauses` (above 20 ms), `lost_contacts`, `absurd_forces` |
+//! | `services.haptic.device` | with a real device: `exchanges` of its thread, `late` ones (more than 2 ms after the one before), times that it was `opened` |
 //! | `events` | what went wrong at the hand as it was logged: `time_s`, `service`, `kind`, `count` since the last of its kind, `total` (see `events.rs`) |
 //! | `services.haptic.inversion` | in a scene that breathes: `ticks` whose position was carried to the patient at rest, `failures` without a rest position (force faded), `residual_mm` of all: `p50`, `p99`, `p999`, `max` |
 //! | `services.deformation.commits`, `moved_elements` | transactions; elements moved, summed over them |
@@ -130,6 +131,15 @@ pub struct FaultReport {
     pub absurd_forces: u64,
 }
 
+/// How a real device was served.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct DeviceReport {
+    pub exchanges: u64,
+    pub late: u64,
+    pub opened: u64,
+}
+
 /// Of the haptic process.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -148,6 +158,8 @@ pub struct HapticReport {
     pub tissue_stood: u64,
     pub allocations: u64,
     pub realtime: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub device: Option<DeviceReport>,
     pub faults: FaultReport,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub inversion: Option<InversionReport>,
@@ -189,7 +201,7 @@ pub struct RenderingReport {
 #[serde(untagged)]
 #[allow(missing_docs)] // the names are the roles
 pub enum Own {
-    Haptic(HapticReport),
+    Haptic(Box<HapticReport>),
     Deformation(DeformationReport),
     Rendering(RenderingReport),
     Console {},
@@ -279,7 +291,7 @@ fn own(role: Role, control: &ControlBlock) -> Own {
     let seconds = n(Counter::RecordedNs) as f64 * 1e-9;
     let rate_hz = if seconds > 0.0 { n(Counter::Iterations) as f64 / seconds } else { 0.0 };
     match role {
-        Role::Haptic => Own::Haptic(HapticReport {
+        Role::Haptic => Own::Haptic(Box::new(HapticReport {
             rate_hz,
             overruns: n(Counter::Overruns),
             tick_us: Durations::of(&cell.duration, 1e3),
@@ -293,6 +305,12 @@ fn own(role: Role, control: &ControlBlock) -> Own {
             tissue_stood: n(Counter::TissueStands),
             allocations: n(Counter::Allocations),
             realtime: n(Counter::NotRealtime) == 0,
+            device: Some(DeviceReport {
+                exchanges: n(Counter::DeviceExchanges),
+                late: n(Counter::DeviceLate),
+                opened: n(Counter::DeviceOpened),
+            })
+            .filter(|device| device.opened > 0),
             faults: FaultReport {
                 jumps: n(Counter::Jumps),
                 invalid_poses: n(Counter::InvalidPoses),
@@ -309,7 +327,7 @@ fn own(role: Role, control: &ControlBlock) -> Own {
                 residual_mm: Durations::of(&control.inversion, 1e6),
             }),
             smooth: Some(SmoothReport { loads: n(Counter::SmoothLoads), without_patch: n(Counter::NoPatch) }).filter(|s| s.loads > 0),
-        }),
+        })),
         Role::Deformation => Own::Deformation(DeformationReport {
             commits: n(Counter::Commits),
             moved_elements: n(Counter::MovedElements),
@@ -389,7 +407,8 @@ impl fmt::Display for RunReport {
         let small = |d: &Durations| format!("{:>9.1e} {:>9.1e} {:>9.1e} {:>9.1e}", d.p50, d.p99, d.p999, d.max);
         for s in self.services.values() {
             match &s.own {
-                Own::Haptic(HapticReport { inversion: Some(i), .. }) => {
+                Own::Haptic(h) => {
+                    let Some(i) = &h.inversion else { continue };
                     writeln!(f, "{:<24} {}  {} ticks without", "rest position mm", small(&i.residual_mm), i.failures)?;
                 }
                 Own::Rendering(RenderingReport { warp: Some(w), .. }) => {

@@ -11,6 +11,7 @@ use crate::{
     governor::Pilot,
     labels, memory,
     needle::NeedleReport,
+    octree::Kept,
     patient::{Patient, Progress},
     recording::Recorder,
     report::{RunReport, ServiceReport, StoreReport},
@@ -68,6 +69,29 @@ pub struct Simulation {
     ended: bool,
 }
 
+/// What was made for a run before its memory: what regions will hold, where the scene calls for it.
+#[derive(Default)]
+pub struct Ready {
+    /// how the patient breathes
+    pub breath: Option<Prepared>,
+    /// the octree of tri-cubics
+    pub octree: Option<Kept>,
+}
+
+impl Ready {
+    fn bytes(&self) -> u64 {
+        let breath: u64 = self.breath.iter().flat_map(Prepared::segments).map(|(_, _, bytes)| bytes).sum();
+        breath + self.octree.as_ref().map_or(0, Kept::segment_bytes)
+    }
+
+    fn publish(&self, store: &mut StoreKeeper, domain: &Domain) -> Result<(), SupervisorError> {
+        if let Some(breath) = &self.breath {
+            breath.publish(store, domain)?;
+        }
+        self.octree.as_ref().map_or(Ok(()), |octree| octree.publish(store, domain))
+    }
+}
+
 /// A domain whose files go when it does.
 struct Files(Domain);
 
@@ -88,12 +112,12 @@ pub fn plan_of(scene: &Scene, volume: &Volume) -> (Plan, StoreSizes) {
 impl Simulation {
     /// Makes all shared memory and all services for a scene on a volume; starts nothing yet. The scene is completed: way
     /// points, camera, threads and absolute paths as the services will read them.
-    pub fn create(mut scene: Scene, (volume, _): &Patient, breath: Option<&Prepared>, by_hand: &[Role]) -> Result<Self, SupervisorError> {
+    pub fn create(mut scene: Scene, (volume, _): &Patient, ready: &Ready, by_hand: &[Role]) -> Result<Self, SupervisorError> {
         let (plan, sizes) = plan_of(&scene, volume);
         resolve(&mut scene, &plan, volume)?;
         let segments = StorePlan { info: volume.info.clone(), sizes }.segments();
         let frames = frame_pool_bytes(plan.frame_bytes);
-        let regions: u64 = breath.map_or(0, |breath| breath.segments().iter().map(|(_, _, bytes)| bytes).sum());
+        let regions = ready.bytes();
         memory::check_space(
             segments.iter().map(|(_, bytes)| *bytes as u64).sum::<u64>() + frames + regions + labels::bytes(&scene, &volume.info.grid),
         )?;
@@ -110,9 +134,7 @@ impl Simulation {
             }
         })?;
         drop(progress);
-        if let Some(breath) = breath {
-            breath.publish(&mut store, &domain.0)?;
-        }
+        ready.publish(&mut store, &domain.0)?;
         labels::publish(&scene, &volume.info.grid, &mut store, &domain.0)?;
         let path = domain.0.directory().join(SCENE_FILE);
         fs::write(&path, scene.to_toml()).map_err(SupervisorError::io(format!("{} cannot be written", path.display())))?;
@@ -259,6 +281,10 @@ fn resolve(scene: &mut Scene, plan: &Plan, volume: &Volume) -> Result<(), Superv
     }
     if let Some(labels) = &scene.volume.labels {
         scene.volume.labels = Some(absolute(labels)?);
+    }
+    // one that has no folder is the system's to find
+    if let Some(library) = scene.device.library.as_ref().filter(|library| library.components().count() > 1) {
+        scene.device.library = Some(absolute(library)?);
     }
     if let Some(model) = &scene.breathing.model {
         scene.breathing.model = Some(absolute(model)?);

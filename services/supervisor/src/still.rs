@@ -1,6 +1,11 @@
 //! A run whose shared memory is there and whose processes are not: for measuring one loop at a time in one process.
 
-use crate::{SupervisorError, patient, simulation::Simulation};
+use crate::{
+    SupervisorError,
+    octree::Kept,
+    patient,
+    simulation::{Ready, Simulation},
+};
 use maille_breathing::Prepared;
 use maille_scene::{Scene, VolumeSource};
 use maille_transport::Domain;
@@ -32,7 +37,8 @@ impl Still {
             true => maille_breathing::prepare(&scene, &patient.0.0.info.grid)?,
             false => None,
         };
-        let mut simulation = Simulation::create(scene, &patient.0, breath.as_ref(), &[])?;
+        let octree = Kept::of(&scene, &patient.0.0, &patient::Part::default())?;
+        let mut simulation = Simulation::create(scene, &patient.0, &Ready { breath, octree }, &[])?;
         simulation.begin();
         Ok(Self(simulation))
     }

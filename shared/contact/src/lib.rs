@@ -45,7 +45,7 @@ pub use device::{
 pub use material::{Material, TissueTable};
 pub use passivity::{Passivity, Port};
 pub use proxy::{Contact, Proxy, Touch};
-pub use shape::{ContactNode, ToolShape};
+pub use shape::{ContactNode, LONGEST_SHAFT, ToolShape};
 pub use shaper::{ForceShaper, Limits};
 pub use surface::{AnalyticSurface, Isosurface, Surface};
 pub use tick::{Faults, HapticConfig, HapticCore, TickInputs, TickOutputs};

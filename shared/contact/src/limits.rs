@@ -9,8 +9,8 @@ pub const MAX_SEARCH_STEPS: usize = 24;
 pub const MAX_BACK_STEPS: usize = 64;
 /// Halvings and secants after a search has found the two sides of the surface.
 pub const MAX_ROOT_STEPS: usize = 24;
-/// Materials of a tissue table.
-pub const MAX_MATERIALS: usize = 16;
+/// Materials of a tissue table: two for a row of a scene's.
+pub const MAX_MATERIALS: usize = 64;
 /// A move of the device by more than this in one tick is a jump [mm]: 10 m/s at 1 kHz, beyond any hand.
 pub const MAX_JUMP_MM: f64 = 10.0;
 /// Longest time step that is believed [s]; after a longer pause the state moves on by this much.

@@ -61,8 +61,7 @@ pub(crate) struct Circumstances<'a> {
     pub other_surface: bool,
     /// value at the surface
     pub threshold: f64,
-    /// largest slope of a law of share 1 [N/mm], and largest damping [N·s/mm]
-    pub stiffness_n_per_mm: f64,
+    /// largest damping of a law of share 1 [N·s/mm]
     pub damping_n_s_per_mm: f64,
 }
 
@@ -113,6 +112,10 @@ pub(crate) struct Node {
     last_force: V3,
     bridge: Bridge,
     absurd: bool,
+    /// δ at the last tick [mm]; 0 without contact
+    indentation_mm: f64,
+    /// slope of the tissue's own law there [N/mm]
+    slope_n_per_mm: f64,
 }
 
 /// A force held to [`MAX_NODE_N`], zero where it is not finite; and whether it had to be.
@@ -139,11 +142,57 @@ impl Node {
             last_force: V3::zeros(),
             bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
             absurd: false,
+            indentation_mm: 0.0,
+            slope_n_per_mm: 0.0,
         }
     }
 
-    /// Contact and force before limits, with the ball's centre at `x` moving with `velocity`; `search` allows a look around for tissue.
-    pub fn touch<S: Surface + ?Sized>(&mut self, tissue: &S, x: V3, velocity: V3, search: bool, now: &Circumstances<'_>) -> Felt {
+    /// What of the coupling's stiffness it called for at the last tick [N/mm], coming in over the first half millimetre.
+    pub fn called_for(&self, stiffness_n_per_mm: f64) -> f64 {
+        self.share * self.slope_n_per_mm.min(stiffness_n_per_mm) * (self.indentation_mm / DAMPING_DEPTH_MM).min(1.0)
+    }
+
+    /// δ⁴ at the last tick: what its part of the coupling goes by where not all can have what they call for.
+    pub fn weight(&self) -> f64 {
+        self.indentation_mm.powi(4)
+    }
+
+    /// Largest slope for this node where `called_for` of all is `called_n_per_mm` and their weights sum to `weights` (`shape`).
+    pub fn slope(&self, called_n_per_mm: f64, weights: f64, stiffness_n_per_mm: f64) -> f64 {
+        let shared = (2.0 * called_n_per_mm / stiffness_n_per_mm - 1.0).clamp(0.0, 1.0);
+        if shared == 0.0 || weights <= 0.0 {
+            return stiffness_n_per_mm;
+        }
+        let own = self.slope_n_per_mm.min(stiffness_n_per_mm);
+        own + (self.weight() / weights * stiffness_n_per_mm - own) * shared
+    }
+
+    /// Contact and force before limits, with the ball's centre at `x` moving with `velocity`; `search` allows a look around for tissue, `slope`
+    /// [N/mm] is the most that its law may have.
+    pub fn touch<S: Surface + ?Sized>(
+        &mut self,
+        tissue: &S,
+        (x, velocity): (V3, V3),
+        search: bool,
+        slope: f64,
+        now: &Circumstances<'_>,
+    ) -> Felt {
+        let felt = self.pressed(tissue, (x, velocity), search, slope, now);
+        self.indentation_mm = felt.contact.map_or(0.0, |(_, indentation)| indentation);
+        if felt.contact.is_none() {
+            self.slope_n_per_mm = 0.0;
+        }
+        felt
+    }
+
+    fn pressed<S: Surface + ?Sized>(
+        &mut self,
+        tissue: &S,
+        (x, velocity): (V3, V3),
+        search: bool,
+        slope: f64,
+        now: &Circumstances<'_>,
+    ) -> Felt {
         let radius = self.proxy.radius_mm();
         let was_felt = self.last_point.is_some();
         if now.jumped {
@@ -183,7 +232,7 @@ impl Node {
         self.last_point = Some(point);
         felt.at = point;
         felt.contact = Some((contact, delta));
-        let force = self.law(tissue, point, normal, delta, velocity, now, &mut felt);
+        let force = self.law(tissue, (point, normal, delta), velocity, slope, now, &mut felt);
         if blend.is_none() {
             felt.granted_mj = (self.bias - bias).max(0.0) * force.dot(&normal).max(0.0);
         }
@@ -222,14 +271,12 @@ impl Node {
     }
 
     /// Normal force, damping and friction [N]; tells the energy in the springs.
-    #[allow(clippy::too_many_arguments)] // a law of that many things
     fn law<S: Surface + ?Sized>(
         &mut self,
         tissue: &S,
-        point: V3,
-        normal: V3,
-        delta: f64,
+        (point, normal, delta): (V3, V3, f64),
         velocity: V3,
+        slope: f64,
         now: &Circumstances<'_>,
         felt: &mut Felt,
     ) -> V3 {
@@ -237,15 +284,16 @@ impl Node {
         let here = now.config.tissue.at(value);
         let material = self.material.map_or(here, |last| last.between(&here, now.dt / (now.dt + MATERIAL_S)));
         self.material = Some(material);
+        self.slope_n_per_mm = material.stiffness_n_per_mm + 2.0 * material.stiffening_n_per_mm2 * delta;
         let damping = material.damping_n_s_per_mm.min(now.damping_n_s_per_mm) * (delta / DAMPING_DEPTH_MM).min(1.0);
-        let elastic = material.normal_force(delta, now.stiffness_n_per_mm);
-        felt.elastic_mj = self.share * material.normal_energy(delta, now.stiffness_n_per_mm);
+        let elastic = material.normal_force(delta, slope);
+        felt.elastic_mj = self.share * material.normal_energy(delta, slope);
         // pressed in: resists; withdrawn: damping may only lower the push, never pull
         let normal_n = (elastic - damping * velocity.dot(&normal)).max(0.0);
         let mut force = normal * normal_n;
         if now.config.friction {
             // tangentially as stiff as the tissue's first contact, within the coupling
-            let k = material.stiffness_n_per_mm.min(now.stiffness_n_per_mm);
+            let k = material.stiffness_n_per_mm.min(slope);
             let rubbing = self.friction.force(point, normal, normal_n, k, material.friction_static, material.friction_kinetic);
             if k > 0.0 {
                 felt.elastic_mj += self.share * 0.5 * rubbing.norm_squared() / k;

@@ -27,14 +27,21 @@
 //! does not license minutes of buzzing [a bounded reference for the energy: Ryu et al. 2005]. Work done by tissue that moves by itself is granted
 //! within a credit (`grant`).
 //!
-//! Units: mm, N, s, kg. Cost: proportional to the delay in ticks, at most 31. Allocation: none. Not here: choosing gains that
+//! **Slow devices.** A device that is read and given its command every h ticks holds that command for h: a new reading's way is paired with the command
+//! that stood when the reading before it was taken, readings that are seen again say nothing, and what is foreseen is h ticks long
+//! ([`Passivity::seen`]).
+//!
+//! **Torque** does its work on the turns, paired and foreseen alike (with an inertia of that mass at [`GYRATION_MM`] from the handle), and is lowered
+//! by the same λ: one balance for both.
+//!
+//! Units: mm, N, N·mm, rad, s, kg. Cost: proportional to the delay in ticks, at most 31. Allocation: none. Not here: choosing gains that
 //! need no controller (`coupling`).
 
 use crate::{
     V3,
     rest::{Balance, Rest},
     restore::{Restore, Standing},
-    velocity::{Estimate, Velocity},
+    velocity::{Estimate, Velocity, WINDOW},
 };
 
 /// Most ticks a pose can be late.
@@ -51,6 +58,8 @@ const DOUBT: f64 = 0.3;
 const CREDIT_MJ: f64 = 10.0;
 /// Ticks after which a force that was lowered counts as steady.
 const LOWERED_TICKS: usize = 256;
+/// Radius of gyration of device and hand about the handle [mm], at least.
+const GYRATION_MM: f64 = 30.0;
 /// Time in which a lowered force comes back [s].
 const SHARE_S: f64 = 0.02;
 
@@ -67,12 +76,14 @@ pub struct Port {
     pub hand_mm_s2: f64,
     /// the device's own damping [N·s/mm]; 0 where nothing is known of it: then a hand at rest is allowed nothing
     pub damping_n_s_per_mm: f64,
+    /// time from tick to tick, as planned [s]: how long a force is held, however late the last tick was
+    pub period_s: f64,
 }
 
 impl Default for Port {
     /// Poses at once and exact; a light desktop device.
     fn default() -> Self {
-        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0, damping_n_s_per_mm: 0.0 }
+        Self { delay_ticks: 0, quantum_mm: 0.0, mass_kg: 0.05, hand_mm_s2: 10_000.0, damping_n_s_per_mm: 0.0, period_s: 1e-3 }
     }
 }
 
@@ -88,6 +99,12 @@ pub struct Passivity {
     velocity: Velocity,
     /// forces given, by tick modulo the length [N]
     given: [V3; MAX_DELAY + 2],
+    /// torques given, alike [N·mm]
+    given_n_mm: [V3; MAX_DELAY + 2],
+    /// last turn seen [rad/s]
+    spin: V3,
+    /// turns under torque so far, as way at [`GYRATION_MM`] [mm]: a tip that stays while the hand turns does not rest
+    swung_mm: V3,
     ticks: usize,
     reserve_mj: f64,
     max_damping_n_s_per_mm: f64,
@@ -105,6 +122,15 @@ pub struct Passivity {
     restore: Restore,
     /// ticks since the force was lowered
     since_lowered: usize,
+    /// age of the last reading [s]
+    age_s: f64,
+    /// time [s] and ticks since the last new reading
+    unread_s: f64,
+    unread: usize,
+    /// ticks between the last new readings
+    paces: [usize; 3],
+    /// the reading is a new one
+    fresh: bool,
 }
 
 impl Passivity {
@@ -123,6 +149,7 @@ impl Passivity {
             mass_kg: hold(port.mass_kg, 0.01, 10.0, 0.05),
             hand_mm_s2: hold(port.hand_mm_s2, 0.0, 1e6, 1e4),
             damping_n_s_per_mm: hold(port.damping_n_s_per_mm, 0.0, 1.0, 0.0),
+            period_s: hold(port.period_s, 1e-5, 0.1, 1e-3),
         };
         Self {
             port,
@@ -131,6 +158,9 @@ impl Passivity {
             rounding: [(0.0, 0.0); 3],
             velocity: Velocity::new(),
             given: [V3::zeros(); MAX_DELAY + 2],
+            given_n_mm: [V3::zeros(); MAX_DELAY + 2],
+            spin: V3::zeros(),
+            swung_mm: V3::zeros(),
             ticks: 0,
             reserve_mj: hold(reserve_mj, 0.0, 1e3, 0.0),
             // a damper that acts late feeds what it should brake: tolerable are gains far below m / t_d
@@ -144,6 +174,11 @@ impl Passivity {
             rest: Rest::new(),
             restore: Restore::new(),
             since_lowered: usize::MAX,
+            age_s: 0.0,
+            unread_s: port.period_s,
+            unread: 1,
+            paces: [1; 3],
+            fresh: true,
         }
     }
 
@@ -172,6 +207,7 @@ impl Passivity {
         self.last_position = None;
         self.velocity.reset();
         self.rest = Rest::new();
+        self.spin = V3::zeros();
     }
 
     /// Work [mJ] that tissue does on the hand by moving: it may be given out, on credit of [`CREDIT_MJ`] that what the hand gives back
@@ -189,28 +225,73 @@ impl Passivity {
         self.share
     }
 
-    /// Work [mJ] that the torque given has done on the hand since the last tick.
-    pub(crate) fn turned(&mut self, work_mj: f64) {
-        self.energy_mj -= work_mj;
+    /// The pose is `age_s` old, `dt_s` after the last tick: to be told before what is seen of it.
+    pub(crate) fn seen(&mut self, age_s: f64, dt_s: f64) {
+        if self.fresh {
+            (self.unread, self.unread_s) = (0, 0.0);
+        }
+        (self.unread, self.unread_s) = ((self.unread + 1).min(MAX_DELAY), self.unread_s + dt_s);
+        // the same reading is older by the time that went by
+        self.fresh = age_s < self.age_s + 0.5 * dt_s;
+        self.age_s = age_s;
+        // a longer silence is a device that was away, not its pace
+        if self.fresh && self.unread < MAX_DELAY {
+            self.paces = [self.paces[1], self.paces[2], self.unread];
+        }
+    }
+
+    /// Ticks from one reading to the next: the median of three, as one late exchange is no slow device.
+    fn pace(&self) -> usize {
+        let [a, b, c] = self.paces;
+        a.max(b).min(a.min(b).max(c)).min(MAX_DELAY)
+    }
+
+    /// How many ticks ago the command was given that stood over the way that a new reading ends.
+    fn stood(&self) -> usize {
+        (self.port.delay_ticks + self.unread.max(1) - 1).min(MAX_DELAY)
+    }
+
+    /// The device is seen turned by `turn` [rad] since the last tick.
+    pub(crate) fn turned(&mut self, turn: V3) {
+        let torque = self.given_n_mm[self.ago(self.stood())];
+        self.energy_mj -= torque.dot(&turn);
+        if torque != V3::zeros() {
+            self.swung_mm += turn * GYRATION_MM;
+        }
+        if self.fresh {
+            self.spin = turn / self.unread_s.max(self.port.period_s);
+        }
+    }
+
+    /// Where stands what was given `ago` ticks before the last.
+    fn ago(&self, ago: usize) -> usize {
+        let length = self.given.len();
+        (self.ticks + 2 * length - 1 - ago) % length
     }
 
     /// The force given `ago` ticks before the last.
     fn force_ago(&self, ago: usize) -> V3 {
-        let length = self.given.len();
-        self.given[(self.ticks + 2 * length - 1 - ago) % length]
+        self.given[self.ago(ago)]
     }
 
     /// The force to give in place of `wanted`, with the device seen at `position` after `dt_s`, when the contact's springs hold
-    /// `elastic_mj`.
-    pub(crate) fn control(&mut self, position: V3, wanted: V3, elastic_mj: f64, dt_s: f64) -> V3 {
+    /// `elastic_mj`. `wanted_n_mm` is to be lowered by [`share`](Self::share).
+    pub(crate) fn control(&mut self, position: V3, wanted: V3, wanted_n_mm: V3, elastic_mj: f64, dt_s: f64) -> V3 {
         let per_mass = 1000.0 / self.port.mass_kg;
-        let delay = self.port.delay_ticks;
+        let pace = self.pace();
+        let delay = (self.port.delay_ticks + pace - 1).min(MAX_DELAY);
         let last = self.force_ago(delay);
-        self.velocity.push(position);
-        let estimate = self.velocity.estimate(self.port.quantum_mm, dt_s, self.port.hand_mm_s2 + per_mass * last.norm());
+        // what lies ahead is a tick as planned: a late one is no reason to fear that the next will be as late, and to let go for that
+        let ahead_s = self.port.period_s;
+        if self.fresh {
+            self.follow(position, self.unread_s);
+        }
+        let estimate = self.velocity.estimate(self.port.quantum_mm, ahead_s, self.port.hand_mm_s2 + per_mass * last.norm());
         let speed_mm_s = estimate.smooth.norm();
-        self.observe(position, &estimate, dt_s);
-        self.rest.push(position);
+        if self.fresh {
+            self.observe(position, &estimate, self.unread_s);
+        }
+        self.rest.push(position + self.swung_mm);
         if self.rest.is_still() {
             let port = &self.port;
             let (damping_n_s_per_mm, quantum_mm, certain_mj) = (port.damping_n_s_per_mm, port.quantum_mm, self.certain_mj());
@@ -227,14 +308,21 @@ impl Passivity {
         // what the pending forces may have given out since the position that is seen
         let mut stored = self.certain_mj() + ADVANCE_MJ - 0.5 * self.port.quantum_mm * one_norm(&last);
         let (mut velocity, mut slack) = (estimate.velocity, SLACK * estimate.error);
+        let (mut spin, per_inertia) = (self.spin, per_mass / (GYRATION_MM * GYRATION_MM));
         for ago in (0..delay).rev() {
+            let torque = self.given_n_mm[self.ago(ago)];
+            let spun = torque * (per_inertia * ahead_s);
+            stored -= torque.dot(&(spin + spun * 0.5)) * ahead_s;
+            spin += spun;
             let force = self.force_ago(ago);
-            let quickened = force * (per_mass * dt_s);
-            slack += SLACK * self.port.hand_mm_s2 * dt_s;
-            stored -= (force.dot(&(velocity + quickened * 0.5)) + force.norm() * slack) * dt_s;
+            let quickened = force * (per_mass * ahead_s);
+            slack += SLACK * self.port.hand_mm_s2 * ahead_s;
+            stored -= (force.dot(&(velocity + quickened * 0.5)) + force.norm() * slack) * ahead_s;
             velocity += quickened;
         }
-        slack += SLACK * self.port.hand_mm_s2 * dt_s;
+        // the command stands until the next exchange
+        let ahead_s = ahead_s * pace as f64;
+        slack += SLACK * self.port.hand_mm_s2 * ahead_s;
         let mut force = wanted;
         let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
         if deficit > 0.0 && wanted.norm_squared() > 0.0 {
@@ -243,23 +331,33 @@ impl Passivity {
             self.dissipated_mj += alpha * speed_mm_s * speed_mm_s * dt_s;
             force -= estimate.smooth * alpha;
         }
-        let out = (force.dot(&velocity) + force.norm() * slack) * dt_s;
-        let quickening = 0.5 * per_mass * force.norm_squared() * dt_s * dt_s;
+        let out = (force.dot(&velocity) + force.norm() * slack + wanted_n_mm.dot(&spin)) * ahead_s;
+        let quickening = 0.5 * (per_mass * force.norm_squared() + per_inertia * wanted_n_mm.norm_squared()) * ahead_s * ahead_s;
         let share = ceiling * largest_share(quickening, out, stored.max(0.0));
         // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
-        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + dt_s / SHARE_S } else { 1.0 });
+        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + self.port.period_s / SHARE_S } else { 1.0 });
         self.lowered += u64::from(self.share < 1.0);
         self.since_lowered = if self.share < 1.0 { 0 } else { self.since_lowered.saturating_add(1) };
         if ceiling > 0.0 { force * (self.share / ceiling) } else { V3::zeros() }
+    }
+
+    /// Takes the position into the estimate of the velocity, whose windows are of ticks as planned: the ticks missed before a late one are
+    /// filled by a straight line.
+    fn follow(&mut self, position: V3, dt_s: f64) {
+        let ticks = (dt_s / self.port.period_s).round().clamp(1.0, WINDOW as f64) as usize;
+        let from = self.last_position.unwrap_or(position);
+        for n in 1..=ticks {
+            self.velocity.push(from + (position - from) * (n as f64 / ticks as f64));
+        }
     }
 
     /// What of the force there may be while it is on its way back (`restore`), and as a share.
     fn restored(&mut self, wanted: V3, speed_mm_s: f64, dt_s: f64) -> (V3, f64) {
         let given_n = self.force_ago(0).norm();
         // as the controller foresees it: nothing but the mass holds against the force
-        let unseen_n_s = given_n * self.port.delay_ticks as f64 * dt_s;
+        let unseen_n_s = given_n * self.port.delay_ticks as f64 * self.port.period_s;
         let standing = Standing {
-            still: self.rest.is_still() && self.port.damping_n_s_per_mm > 0.0,
+            still: self.rest.is_still() && self.given_n_mm[self.ago(0)] == V3::zeros() && self.port.damping_n_s_per_mm > 0.0,
             certain_mj: self.certain_mj(),
             pending_mj: 500.0 / self.port.mass_kg * unseen_n_s * unseen_n_s,
             share: self.share,
@@ -281,8 +379,9 @@ impl Passivity {
             return;
         };
         let moved = position - last;
-        let force = self.force_ago(self.port.delay_ticks);
-        let change = force - self.force_ago(self.port.delay_ticks + 1);
+        let stood = self.stood();
+        let force = self.force_ago(stood);
+        let change = force - self.force_ago((stood + self.paces[1]).min(MAX_DELAY + 1));
         self.energy_mj -= force.dot(&moved);
         let quantum = self.port.quantum_mm;
         if quantum > 0.0 {
@@ -301,9 +400,10 @@ impl Passivity {
     }
 
     /// Tells the observer what the device was really given.
-    pub(crate) fn given(&mut self, force: V3) {
-        let length = self.given.len();
-        self.given[self.ticks % length] = force;
+    pub(crate) fn given(&mut self, force: V3, torque_n_mm: V3) {
+        let at = self.ticks % self.given.len();
+        self.given[at] = force;
+        self.given_n_mm[at] = torque_n_mm;
         self.ticks += 1;
     }
 }
@@ -349,8 +449,12 @@ mod tests {
             let mut worst = 0.0f64;
             for _ in 0..5000 {
                 let wanted = V3::new(0.0, 0.0, if x < 0.0 { -k * x } else { 0.0 });
-                let f = if controlled { p.control(V3::new(0.0, 0.0, x), wanted, 0.5 * k * x.min(0.0).powi(2), dt) } else { wanted };
-                p.given(f);
+                let f = if controlled {
+                    p.control(V3::new(0.0, 0.0, x), wanted, V3::zeros(), 0.5 * k * x.min(0.0).powi(2), dt)
+                } else {
+                    wanted
+                };
+                p.given(f, V3::zeros());
                 for _ in 0..20 {
                     let hand = -0.5; // a light push towards the wall
                     v += (f.z + hand - b * v) / mass * dt / 20.0;

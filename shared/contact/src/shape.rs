@@ -5,10 +5,17 @@
 //! the handle Σ (s_i − x_h) × F_i with s_i the contact points.
 //!
 //! Tool frame: origin at the tip's centre, z where the tool points. Shares: `share` is the part of the tissue's law that a node presses
-//! (1 for a ball or a piece of a shaft; 1/n for n nodes that sample one face). The coupling's stiffness is divided by shares, so that
-//! all nodes together never exceed it, however many touch. Units: mm. Allocation: none. Not here: contact itself (`node`).
+//! (1 for a ball; for a piece of a shaft its length over the diameter; 1/n for n nodes that sample one face). While the slopes of the
+//! touching nodes' own laws sum to less than half of the coupling's K, each has its own, and the forces are those of one potential. Where they
+//! exceed K it is divided by depth, K_i = K δ_i⁴ / Σ share_j δ_j⁴ (between both linearly): one that touches alone has it whole, a further one
+//! comes in from nothing, and all together never exceed it, however many touch: moved alike by dx, stiff nodes of equal share push by
+//! K Σδ⁵/Σδ⁴, whose slope 5K − 4K Σδ⁵ Σδ³/(Σδ⁴)² is at most K (Cauchy and Schwarz), and with the fourth power never below 0.89 K for two.
+//! Units: mm. Allocation: none. Not here: contact itself (`node`).
 
 use crate::{V3, finite, limits::MAX_NODES};
+
+/// Longest shaft that balls stand for [radii]: beyond it they would leave gaps.
+pub const LONGEST_SHAFT: f64 = 20.0;
 
 /// A ball fixed to the tool.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,7 +55,8 @@ impl ToolShape {
     }
 
     /// A shaft with round ends, from the tip backwards: an endoscope. Its balls stand at most a radius apart (so they lie at most 0.14
-    /// radii below the true capsule) up to 15 radii of length, further apart beyond.
+    /// radii below the true capsule) up to 15 radii of length, further apart beyond: 0.26 radii at [`LONGEST_SHAFT`]. The tip presses the law of a
+    /// ball, what follows that of one ball a diameter: so a level shaft's force goes by its length, not by the number of balls.
     pub fn capsule(radius_mm: f64, length_mm: f64) -> Self {
         let radius = if radius_mm.is_finite() { radius_mm.clamp(0.05, 50.0) } else { 1.0 };
         let length = if length_mm.is_finite() { length_mm.clamp(0.0, 500.0) } else { 0.0 };
@@ -56,6 +64,9 @@ impl ToolShape {
         let mut nodes = [ContactNode { offset_mm: [0.0; 3], radius_mm: radius, share: 1.0 }; MAX_NODES];
         for (n, node) in nodes.iter_mut().enumerate().take(gaps + 1) {
             node.offset_mm[2] = -length * n as f64 / gaps as f64;
+            if n > 0 {
+                node.share = 0.5 * length / (gaps as f64 * radius);
+            }
         }
         Self::new(&nodes[..if length > 0.0 { gaps + 1 } else { 1 }])
     }
@@ -93,7 +104,7 @@ impl ToolShape {
         &self.nodes[..self.count]
     }
 
-    /// Sum of the shares: a coupling's stiffness is divided by it.
+    /// Sum of the shares.
     pub fn total_share(&self) -> f64 {
         self.nodes().iter().map(|n| n.share).sum()
     }

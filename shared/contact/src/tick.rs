@@ -27,6 +27,8 @@ use crate::{
 };
 use nalgebra::{Quaternion, UnitQuaternion};
 
+/// Time constant of the mean age of poses [s]: one late exchange is no slow device.
+const POSE_AGE_S: f64 = 0.2;
 /// Time constant of the velocity estimate [s].
 const VELOCITY_S: f64 = 0.005;
 /// No hand is faster [mm/s]: what a device says of its velocity beyond this is not taken, and positions alone count.
@@ -77,6 +79,9 @@ pub struct HapticConfig {
     pub max_torque_n_mm: f64,
     /// see `max_torque_n_mm`
     pub max_torque_slew_n_mm_per_s: f64,
+    /// s: millimetres of the patient for one of the hand. What the device gets is the force as it is and the torque over s (a lever is 1/s longer in the
+    /// hand), so that both come from one potential; energies at its port, its encoder, mass and damping, are the hand's, in the hand's millimetres
+    pub patient_mm_per_hand_mm: f64,
 }
 
 impl HapticConfig {
@@ -103,6 +108,7 @@ impl HapticConfig {
             handle_mm: [0.0; 3],
             max_torque_n_mm: 0.0,
             max_torque_slew_n_mm_per_s: 0.0,
+            patient_mm_per_hand_mm: 1.0,
         }
     }
 
@@ -118,10 +124,28 @@ impl HapticConfig {
         period_s: f64,
         device: &DeviceProfile,
     ) -> Result<(Self, bool), CouplingError> {
-        let stiffness = stiffness_n_per_mm.min(device.max_stiffness_n_per_mm);
+        Self::on_scaled_device(radius_mm, stiffness_n_per_mm, damping_n_s_per_mm, period_s, device, 1.0)
+    }
+
+    /// The same where a millimetre of the hand is `scale` millimetres of the patient: gains are the patient's, at the hand they are `scale` times as
+    /// large, and that is what the device has to render. A scale that is none counts as 1.
+    ///
+    /// # Errors
+    /// As [`HapticConfig::on_device`].
+    pub fn on_scaled_device(
+        radius_mm: f64,
+        stiffness_n_per_mm: f64,
+        damping_n_s_per_mm: f64,
+        period_s: f64,
+        device: &DeviceProfile,
+        scale: f64,
+    ) -> Result<(Self, bool), CouplingError> {
+        let scale = if scale.is_finite() && scale > 0.0 { scale.clamp(0.01, 100.0) } else { 1.0 };
+        let stiffness = stiffness_n_per_mm.min(device.max_stiffness_n_per_mm / scale);
         let (coupling, lowered) =
-            Coupling::lowered_delayed(stiffness, damping_n_s_per_mm, device.damping_n_s_per_mm, period_s, device.delay_s)?;
+            Coupling::lowered_delayed(stiffness, damping_n_s_per_mm, device.damping_n_s_per_mm / scale, period_s, device.delay_s)?;
         let mut config = Self::new(radius_mm, coupling);
+        config.patient_mm_per_hand_mm = scale;
         config.period_s = period_s;
         config.limits.max_force_n = device.max_force_n;
         config.passivity = true;
@@ -130,9 +154,9 @@ impl HapticConfig {
         config.pose_quantum_mm = device.quantum_mm;
         config.device_mass_kg = device.mass_kg;
         config.device_damping_n_s_per_mm = device.damping_n_s_per_mm;
-        config.max_torque_n_mm = device.max_torque_n_mm;
+        config.max_torque_n_mm = device.max_torque_n_mm * scale;
         // as the force: its whole range in some 30 ms
-        config.max_torque_slew_n_mm_per_s = 30.0 * device.max_torque_n_mm;
+        config.max_torque_slew_n_mm_per_s = 30.0 * config.max_torque_n_mm;
         Ok((config, lowered || stiffness < stiffness_n_per_mm))
     }
 }
@@ -213,8 +237,6 @@ pub struct TickOutputs {
 pub struct HapticCore {
     config: HapticConfig,
     nodes: [Node; MAX_NODES],
-    /// largest slope of a law of share 1 [N/mm], so that all nodes together stay within the coupling
-    slope: f64,
     passivity: Passivity,
     shaper: ForceShaper,
     torque_shaper: ForceShaper,
@@ -228,6 +250,10 @@ pub struct HapticCore {
     orientation: Option<UnitQuaternion<f64>>,
     /// [rad/s]
     spin: V3,
+    /// mean age of the poses [s]
+    pose_age_s: f64,
+    /// part of the force that the device gives
+    gives: f64,
     epoch: Option<u64>,
     threshold: f64,
     /// force before limits at the last tick [N]
@@ -244,6 +270,8 @@ impl HapticCore {
     pub fn new(config: HapticConfig) -> Self {
         let mut config = config;
         config.blend_s = if config.blend_s.is_finite() { config.blend_s.clamp(0.01, 1.0) } else { 0.02 };
+        let scale = config.patient_mm_per_hand_mm;
+        config.patient_mm_per_hand_mm = if scale.is_finite() && scale > 0.0 { scale.clamp(0.01, 100.0) } else { 1.0 };
         config.period_s = if config.period_s.is_finite() { config.period_s.clamp(1e-5, MAX_STEP_S) } else { 1e-3 };
         if config.shape.nodes().len() == 1 && config.shape.nodes()[0].offset_mm == [0.0; 3] {
             // a radius set after `HapticConfig::new`
@@ -254,6 +282,7 @@ impl HapticCore {
             quantum_mm: config.pose_quantum_mm,
             mass_kg: config.device_mass_kg,
             damping_n_s_per_mm: config.device_damping_n_s_per_mm,
+            period_s: config.period_s,
             ..Port::default()
         };
         let mut nodes = [Node::new(&config.shape.nodes()[0]); MAX_NODES];
@@ -263,7 +292,6 @@ impl HapticCore {
         let torque = Limits { max_force_n: config.max_torque_n_mm, max_slew_n_per_s: config.max_torque_slew_n_mm_per_s, ..config.limits };
         Self {
             nodes,
-            slope: config.coupling.stiffness_n_per_mm() / config.shape.total_share(),
             passivity: Passivity::on_port(RESERVE_MJ, config.passivity_damping_n_s_per_mm, port),
             shaper: ForceShaper::new(config.limits),
             torque_shaper: ForceShaper::new(torque),
@@ -275,6 +303,8 @@ impl HapticCore {
             world_from_tool: None,
             orientation: None,
             spin: V3::zeros(),
+            pose_age_s: 0.0,
+            gives: 1.0,
             epoch: None,
             threshold: f64::NAN,
             last_wanted: V3::zeros(),
@@ -293,6 +323,11 @@ impl HapticCore {
             let q = Quaternion::new(xyzw[3], xyzw[0], xyzw[1], xyzw[2]);
             self.orientation = Some(UnitQuaternion::from_quaternion(q));
         }
+    }
+
+    /// What part of the force of the ticks to come the device really gives, 0 to 1 (while it is away, or rises again): the observer counts that.
+    pub fn set_given(&mut self, part: f64) {
+        self.gives = if part.is_finite() { part.clamp(0.0, 1.0) } else { 1.0 };
     }
 
     /// What it was made with.
@@ -327,6 +362,9 @@ impl HapticCore {
     ) -> TickOutputs {
         let dt = self.step_time(inputs.now_ns);
         let mut fading = inputs.release;
+        if self.config.passivity {
+            self.passivity.seen(if inputs.pose_age_s.is_finite() { inputs.pose_age_s.max(0.0) } else { MAX_STEP_S }, dt);
+        }
         let (x, jumped) = self.accept_pose(&inputs.pose, inputs.pose_age_s, dt, &mut fading);
         let tissue_late = inputs.tissue_age_s.is_nan() || inputs.tissue_age_s > self.config.max_tissue_age_s;
         if inputs.tissue.is_none() || tissue_late {
@@ -365,16 +403,20 @@ impl HapticCore {
         out.torque_n_mm = self.torque_shaper.shape(self.last_torque.into(), step, fading);
         if self.config.passivity && self.position.is_some() {
             // after the limits: a fall that the slew limit would stretch may be more than is stored
-            let port = moving.as_ref().map_or(x, |moving| V3::from(moving.port_mm()));
+            // what the device does is measured in its own millimetres: its encoder's steps, its mass, the work of the hand
+            let in_hand = 1.0 / self.config.patient_mm_per_hand_mm;
+            let port = moving.as_ref().map_or(x, |moving| V3::from(moving.port_mm())) * in_hand;
             if let Some(moving) = &moving {
-                self.passivity.grant(given.dot(&V3::from(moving.moved_mm())));
+                self.passivity.grant(given.dot(&V3::from(moving.moved_mm())) * in_hand);
             }
-            let force = self.passivity.control(port, V3::from(out.force_n), self.elastic_mj, dt);
+            let torque = V3::from(out.torque_n_mm) * in_hand;
+            let force = self.passivity.control(port, V3::from(out.force_n), torque, self.elastic_mj * in_hand, dt);
             self.shaper.cut_to(force);
             self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
             (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
         }
-        self.passivity.given(V3::from(out.force_n));
+        let torque = V3::from(out.torque_n_mm) / self.config.patient_mm_per_hand_mm;
+        self.passivity.given(V3::from(out.force_n) * self.gives, torque * self.gives);
         out.fading = fading;
         out.faults = self.faults;
         out
@@ -402,6 +444,9 @@ impl HapticCore {
     fn accept_pose(&mut self, pose: &DevicePose, age_s: f64, dt: f64, fading: &mut bool) -> (V3, bool) {
         let stale = age_s.is_nan() || age_s > self.config.max_pose_age_s;
         self.faults.stale_poses += u64::from(stale);
+        if !stale {
+            self.pose_age_s += (age_s.max(0.0) - self.pose_age_s) * (dt / (dt + POSE_AGE_S));
+        }
         let position = finite(pose.position_mm).filter(|p| pose.valid && p.amax() < 1e6);
         self.faults.invalid_poses += u64::from(position.is_none());
         *fading |= stale || position.is_none();
@@ -411,7 +456,8 @@ impl HapticCore {
         };
         let moved = self.position.map_or(V3::zeros(), |last| x - last);
         self.position = Some(x);
-        let jumped = moved.norm() > MAX_JUMP_MM;
+        // no hand moves so far in a tick, and where a hand's way is drawn smaller, not so far in the patient
+        let jumped = moved.norm() > MAX_JUMP_MM * self.config.patient_mm_per_hand_mm.min(1.0);
         if jumped {
             self.faults.jumps += 1;
             self.velocity = V3::zeros();
@@ -422,6 +468,19 @@ impl HapticCore {
             self.velocity += (moved / dt - self.velocity) * (dt / (dt + VELOCITY_S));
         }
         (x, jumped)
+    }
+
+    /// K that the device renders passively at the pace at which it answers [N/mm]. Read and given every h, poses are h/2 old on average; what is read
+    /// is given an exchange later at worst and held for one: late by 3 h/2 in all, three times the mean age. A device as quick as its profile says
+    /// has its whole coupling.
+    fn rendered_stiffness(&self) -> f64 {
+        let period = self.config.period_s;
+        // the delay that the coupling was made for: the observer's has a tick more
+        let (half, declared) = (0.5 * period, self.config.pose_delay_ticks.saturating_sub(1) as f64 * period);
+        // at an exchange a tick, 3/2 of a period: that is in what is declared
+        let slower = if self.config.passivity && declared > 0.0 { (3.0 * self.pose_age_s - 1.5 * period).max(0.0) } else { 0.0 };
+        let late = declared + slower;
+        self.config.coupling.stiffness_n_per_mm() * (half + declared) / (half + late)
     }
 
     /// Orientation of the tool in this tick; whether it, or the device before, jumped.
@@ -460,7 +519,7 @@ impl HapticCore {
             self.spin += (turned / dt - self.spin) * (dt / (dt + VELOCITY_S));
         }
         if self.config.passivity {
-            self.passivity.turned(V3::from(self.torque_shaper.last_n()).dot(&turned));
+            self.passivity.turned(turned);
         }
         false
     }
@@ -488,7 +547,6 @@ impl HapticCore {
             committed,
             other_surface,
             threshold,
-            stiffness_n_per_mm: self.slope,
             damping_n_s_per_mm: self.config.coupling.damping_n_s_per_mm() / self.config.shape.total_share(),
         };
         let rotation = self.world_from_tool.unwrap_or_else(UnitQuaternion::identity);
@@ -498,6 +556,9 @@ impl HapticCore {
         let (mut force, mut torque, mut buried) = (V3::zeros(), V3::zeros(), 0);
         let mut deepest: Option<(usize, V3, Contact)> = None;
         self.elastic_mj = 0.0;
+        let stiffness = self.rendered_stiffness();
+        let called: f64 = self.nodes[..count].iter().map(|node| node.called_for(stiffness)).sum();
+        let weights: f64 = self.nodes.iter().zip(shape.nodes()).map(|(node, of)| of.share * node.weight()).sum();
         for (n, (node, of)) in self.nodes.iter_mut().zip(shape.nodes()).enumerate() {
             let mut arm = rotation * V3::from(of.offset_mm);
             if let Some(moving) = moving.as_deref_mut().filter(|_| of.offset_mm != [0.0; 3]) {
@@ -505,7 +566,8 @@ impl HapticCore {
             }
             let velocity = self.velocity + self.spin.cross(&arm);
             let search = (n + count - self.ticks * MAX_SEARCHES % count) % count < MAX_SEARCHES;
-            let felt = node.touch(tissue, x + arm, velocity, search, &now);
+            let slope = node.slope(called, weights, stiffness);
+            let felt = node.touch(tissue, (x + arm, velocity), search, slope, &now);
             force += felt.force;
             torque += (felt.at - handle).cross(&felt.force);
             buried += usize::from(felt.buried);
@@ -513,7 +575,7 @@ impl HapticCore {
             self.faults.absurd_forces += u64::from(node.took_absurd());
             self.elastic_mj += felt.elastic_mj;
             if self.config.passivity {
-                self.passivity.grant(felt.granted_mj);
+                self.passivity.grant(felt.granted_mj / self.config.patient_mm_per_hand_mm);
             }
             if let Some((contact, indentation)) = felt.contact {
                 out.nodes |= 1 << n;

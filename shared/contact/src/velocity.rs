@@ -10,7 +10,7 @@
 use crate::V3;
 
 /// Longest window [ticks].
-const WINDOW: usize = 16;
+pub(crate) const WINDOW: usize = 16;
 
 /// The last positions of a device, and their velocity.
 #[derive(Clone, Copy, Debug)]

@@ -105,6 +105,35 @@ fn time_that_goes_back_or_stands_still_or_leaps_is_bounded() {
     assert!(faults.time_backwards >= 100 && faults.pauses >= 100, "{faults:?}");
 }
 
+/// Neither is a reason to let go of a wall under a tip that rests, nor to let go faster than the limits of one tick.
+#[test]
+fn ticks_that_come_late_or_early_are_no_steps_of_a_force_that_is_held() {
+    let volume = ball();
+    let tissue = Isosurface::new(&volume, 0.0);
+    for (delay, quantum_mm) in [(0, 0.0), (0, 0.05), (3, 0.0), (3, 0.05)] {
+        let mut d = Driver::new(HapticConfig {
+            passivity: true,
+            pose_delay_ticks: delay,
+            pose_quantum_mm: quantum_mm,
+            device_mass_kg: 0.2,
+            device_damping_n_s_per_mm: 0.003,
+            ..config()
+        });
+        let before = pressed(&mut d, &tissue);
+        assert!(before > 0.5, "{before}");
+        let mut last = V3::from(d.tick(&tissue, 1, V3::new(0.0, 0.0, 12.0)).force_n);
+        for late_us in [700, 1_600, 4_000, 6_000, 9_000, 12_000, 19_000, 60_000] {
+            for (n, offset_us) in [late_us, -950].into_iter().chain([0; 200]).enumerate() {
+                d.now_ns = d.now_ns.saturating_add_signed(offset_us * 1_000);
+                let force = V3::from(d.tick(&tissue, 1, V3::new(0.0, 0.0, 12.0)).force_n);
+                assert!((force - last).norm() <= 0.02, "{late_us} µs late, tick {n} after, {delay} ticks' delay: {last:?} → {force:?}");
+                last = force;
+            }
+        }
+        assert!((last.norm() - before).abs() < 0.05, "{before} → {last:?}");
+    }
+}
+
 #[test]
 fn a_lost_snapshot_a_stale_pose_and_the_end_fade_within_the_time_declared() {
     let volume = ball();

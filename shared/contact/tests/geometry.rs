@@ -14,31 +14,34 @@ fn directions(count: usize) -> impl Iterator<Item = V3> {
     })
 }
 
-/// Truth: depth R + r − |x|, along x. Bounds: the issue's, 1 % and 1°; the splines leave some 0.01 mm of 1 mm and 0.3°.
+/// Truth: depth R + r − |x|, along x. Bounds: 1 % and 1° from 1 mm of depth on; the splines leave up to 0.01 mm (0.02 mm where the ball lies off the grid) of
+/// the surface's place and 0.3°, which at shallower depths is more than 1 % of next to nothing: there the force is held to those 0.02 mm.
 #[test]
 fn force_on_a_ball_has_its_normal_within_one_degree_and_its_size_within_one_per_cent() {
     for radius in [10.0, 12.5, 18.0] {
-        let volume = sampled(64, |x| edge(radius - x.norm()));
+        let off = V3::new(0.31, -0.17, 0.43) * if radius > 12.0 { 1.0 } else { 0.0 };
+        let volume = sampled(64, |x| edge(radius - (x - off).norm()));
         let tissue = Isosurface::new(&volume, 0.0);
         let (mut worst_angle, mut worst_size) = (0.0f64, 0.0f64);
         for u in directions(200) {
             let mut d = Driver::new(plain(2.0, SPRING));
-            for depth in [-3.0, -1.5, 0.0, 1.0, 2.5, 4.0] {
-                let x = u * (radius + 2.0 - depth);
+            for depth in [-3.0, -1.5, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5, 4.0] {
+                let x = off + u * (radius + 2.0 - depth);
                 let mut out = d.tick(&tissue, 1, x);
                 for _ in 0..5 {
                     out = d.tick(&tissue, 1, x);
                 }
                 if depth < 0.0 {
                     assert_eq!(out.force_n, [0.0; 3]);
-                } else if depth >= 1.0 {
+                } else {
                     let f = V3::from(out.force_n);
                     worst_angle = worst_angle.max(f.angle(&u).to_degrees());
                     if depth >= 1.0 {
                         worst_size = worst_size.max((f.norm() / (0.5 * depth) - 1.0).abs());
                     }
                     assert!(out.in_contact && (out.penetration_mm - depth).abs() < 0.02, "{radius} {depth}: {}", out.penetration_mm);
-                    assert!((V3::from(out.proxy_mm).norm() - radius - 2.0).abs() < 0.02);
+                    assert!((f.norm() - 0.5 * depth).abs() <= 0.5 * 0.02, "{radius} {depth}: {} N", f.norm());
+                    assert!(((V3::from(out.proxy_mm) - off).norm() - radius - 2.0).abs() < 0.02);
                 }
             }
         }

@@ -45,25 +45,23 @@ fn lowered(core: &mut HapticCore, tissue: &impl Surface, at: V3, direction: V3) 
     out.unwrap()
 }
 
-/// A shaft held level over a wall, 1 mm deep: every ball pushes alike, the force is the sum and the torque about the tip that of a force in
-/// the shaft's middle.
+/// A shaft held level over a wall, 1 mm deep: the tip pushes as a ball, what follows as one ball a diameter, and the torque about the tip is theirs.
 #[test]
-fn a_level_shaft_is_pushed_in_its_middle() {
+fn a_level_shaft_is_pushed_along_its_length() {
     let shape = ToolShape::capsule(2.0, 20.0);
-    let count = shape.nodes().len() as f64;
     let mut core = HapticCore::new(config(shape));
     let out = lowered(&mut core, &wall(), V3::new(0.0, 0.0, 1.0), V3::x());
-    assert_eq!(out.nodes.count_ones() as f64, count);
-    // the law's 0.5 N/mm a ball
-    assert!((V3::from(out.force_n) - V3::new(0.0, 0.0, 0.5 * count)).norm() < 1e-6, "{out:?}");
-    // the middle lies at −10 mm along x: (−10, 0, ·) × (0, 0, F) = (0, 10 F, 0)
-    assert!((V3::from(out.torque_n_mm) - V3::new(0.0, 10.0 * 0.5 * count, 0.0)).norm() < 1e-4, "{:?}", out.torque_n_mm);
+    assert_eq!(out.nodes.count_ones() as usize, shape.nodes().len());
+    // the law's 0.5 N/mm, by the tip and by five diameters
+    assert!((V3::from(out.force_n) - V3::new(0.0, 0.0, 0.5 * 6.0)).norm() < 1e-6, "{out:?}");
+    // ten balls, −2 … −20 mm along x, each half a diameter: (−11, 0, ·) × (0, 0, F) = (0, 11 F, 0)
+    assert!((V3::from(out.torque_n_mm) - V3::new(0.0, 11.0 * 0.5 * 5.0, 0.0)).norm() < 1e-4, "{:?}", out.torque_n_mm);
 }
 
 /// Torque is about the handle: there is none where the handle is over the contact.
 #[test]
 fn torque_is_about_the_handle() {
-    let mut core = HapticCore::new(HapticConfig { handle_mm: [0.0, 0.0, -10.0], ..config(ToolShape::capsule(2.0, 20.0)) });
+    let mut core = HapticCore::new(HapticConfig { handle_mm: [0.0, 0.0, -55.0 / 6.0], ..config(ToolShape::capsule(2.0, 20.0)) });
     let out = lowered(&mut core, &wall(), V3::new(0.0, 0.0, 1.0), V3::x());
     assert!(V3::from(out.torque_n_mm).norm() < 1e-4 && out.force_n[2] > 1.0, "{out:?}");
 }
@@ -82,9 +80,39 @@ fn a_shaft_feels_what_its_tip_does_not() {
     let tip = lowered(&mut HapticCore::new(config(ToolShape::sphere(2.0))), &ridge, at, V3::x());
     assert_eq!(tip.force_n, [0.0; 3]);
     let shaft = lowered(&mut HapticCore::new(config(ToolShape::capsule(2.0, 30.0))), &ridge, at, V3::x());
-    // a ball stands right over the ridge (30 mm in 15 gaps): 0.4 mm deep
-    assert!((shaft.force_n[2] - 0.2).abs() < 0.01 && shaft.in_contact, "{shaft:?}");
+    // a ball stands right over the ridge (30 mm in 15 gaps): 0.4 mm deep, half a diameter of shaft
+    assert!((shaft.force_n[2] - 0.1).abs() < 0.01 && shaft.in_contact, "{shaft:?}");
     assert!((V3::from(shaft.torque_n_mm) - V3::new(0.0, 12.0 * shaft.force_n[2], 0.0)).norm() < 0.05, "{:?}", shaft.torque_n_mm);
+}
+
+/// The tip of a shaft on a wall beyond what the device can render is as hard as a tip alone; a level shaft's push goes by its length, not by
+/// how many balls stand for it.
+#[test]
+fn a_shaft_is_as_hard_as_its_tip_and_its_push_goes_by_length() {
+    let coupling = Coupling::new(0.4, 0.0, 0.005, 1e-3).unwrap();
+    let bone = TissueTable::uniform(Material { stiffness_n_per_mm: 50.0, ..SPRING });
+    let steep = |shape| {
+        let config = HapticConfig { coupling, radius_mm: 3.0, tissue: bone, ..config(shape) };
+        lowered(&mut HapticCore::new(config), &wall(), V3::new(0.0, 0.0, -2.0), -V3::z())
+    };
+    let (tip, shaft) = (steep(ToolShape::sphere(3.0)).force_n[2], steep(ToolShape::capsule(3.0, 40.0)));
+    assert_eq!(shaft.nodes.count_ones(), 2, "upright, 5 mm deep: the tip and the next, 2.9 mm behind it");
+    assert!(
+        tip > 1.9 && shaft.force_n[2] > 0.95 * tip && shaft.force_n[2] <= tip + 1e-9,
+        "{tip} N alone, {:?} N with a shaft",
+        shaft.force_n[2]
+    );
+    let level = |radius: f64, length: f64| {
+        let soft = HapticConfig {
+            tissue: TissueTable::uniform(Material { stiffness_n_per_mm: 0.02, ..SPRING }),
+            ..config(ToolShape::capsule(radius, length))
+        };
+        lowered(&mut HapticCore::new(soft), &wall(), V3::new(0.0, 0.0, radius - 1.0), V3::x()).force_n[2] / 0.02
+    };
+    for (radius, length) in [(2.0, 20.0), (2.0, 40.0), (1.0, 20.0), (3.0, 50.0), (5.0, 3.0)] {
+        let balls = level(radius, length);
+        assert!((balls - (1.0 + length / (2.0 * radius))).abs() < 1e-3, "{radius} × {length} mm: {balls} balls' push");
+    }
 }
 
 /// However many balls touch, on however stiff a wall, the force grows with depth no faster than the coupling allows.

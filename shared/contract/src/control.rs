@@ -141,10 +141,16 @@ pub enum Counter {
     LostContacts = 28,
     /// forces of a contact that were none, or beyond what any device gives (haptic)
     AbsurdForces = 29,
+    /// exchanges of the device's thread with a real device (haptic)
+    DeviceExchanges = 31,
+    /// of these, such as came more than 2 ms after the one before (haptic)
+    DeviceLate = 32,
+    /// times that a real device was opened: more than once where it was lost (haptic)
+    DeviceOpened = 33,
 }
 
 /// Number of counters.
-pub const COUNTERS: usize = 32;
+pub const COUNTERS: usize = 40;
 
 /// Stages of a service's loop that can be timed; the registry of effects names them, in the order of the plan.
 pub const STAGES: usize = 16;

@@ -9,7 +9,7 @@ use bytemuck::Zeroable;
 use core::sync::atomic::{AtomicU32, AtomicU64};
 
 /// "mailidx" and the version of this layout.
-pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx3");
+pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx4");
 /// Entries of a leaf page.
 pub const LEAF_LEN: usize = 64;
 /// Entry of something that does not exist.
@@ -17,7 +17,7 @@ pub const ABSENT: u32 = u32::MAX;
 /// Bits of a head word that number the root page; the rest is the epoch.
 pub const ROOT_BITS: u32 = 16;
 /// Channels of a store, present or not: one that the plan does not ask for has no entries, no slots and no segment.
-pub const CHANNELS: usize = 6;
+pub const CHANNELS: usize = 7;
 
 /// Channel numbers. All but voxels and state hold bricks that are absent until they are first written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,11 +36,14 @@ pub enum Channel {
     Cuts = 4,
     /// labels, a byte a voxel
     Labels = 5,
+    /// leaves of the octree for a brick that was rewritten, beside the octree that the region of that name keeps; what the bytes mean is `maille-vif`'s
+    Octree = 6,
 }
 
 impl Channel {
     /// All, in order of their numbers.
-    pub const ALL: [Self; CHANNELS] = [Self::Voxels, Self::Displacement, Self::State, Self::Plastic, Self::Cuts, Self::Labels];
+    pub const ALL: [Self; CHANNELS] =
+        [Self::Voxels, Self::Displacement, Self::State, Self::Plastic, Self::Cuts, Self::Labels, Self::Octree];
 }
 
 /// What a channel holds.

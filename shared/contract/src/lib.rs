@@ -19,6 +19,7 @@ pub mod index;
 pub mod messages;
 pub mod names;
 pub mod needle;
+pub mod octree;
 pub mod probe;
 pub mod segment_header;
 
@@ -26,3 +27,4 @@ pub use breath::{BreathLead, BreathState, MotionHeader};
 pub use control::{ControlBlock, KnobState, RunState, ServiceCell, ServiceState, Switches};
 pub use messages::{Commit, FrameHeader, Stamp, ToolCommand, ToolMove, ToolState, UndoCommand, ViewState};
 pub use names::Role;
+pub use octree::OctreeHeader;

@@ -180,12 +180,16 @@ pub struct DeviceState {
     pub direction: [f64; 3],
     /// velocity of the tip [mm/s], where [`DEVICE_KNOWS_VELOCITY`]
     pub velocity_mm_s: [f64; 3],
+    /// orientation of the tool (x, y, z, w), where [`DEVICE_KNOWS_ORIENTATION`]: takes its frame, whose z is where it points, to the patient's
+    pub orientation: [f64; 4],
 }
 
 /// In [`DeviceState::flags`]: the device vouches for what it says (plugged in, homed).
 pub const DEVICE_VALID: u64 = 1;
 /// In [`DeviceState::flags`]: the velocity is the device's own.
 pub const DEVICE_KNOWS_VELOCITY: u64 = 1 << 1;
+/// In [`DeviceState::flags`]: the device knows how it is turned.
+pub const DEVICE_KNOWS_ORIENTATION: u64 = 1 << 2;
 
 /// What a device outside the haptic process shall render, in a cell of the control block. Writer: haptic, every tick. Reader: whoever drives
 /// the device.
@@ -203,6 +207,8 @@ pub struct DeviceForce {
     pub incarnation: u64,
     /// force on the hand [N]
     pub force_n: [f64; 3],
+    /// torque on the hand about the tip [N·mm], within the torque of the device's profile; zero where that has none
+    pub torque_n_mm: [f64; 3],
 }
 
 /// Views in a frame, in this order.
@@ -264,7 +270,9 @@ impl ToolCommand {
 impl DeviceState {
     /// The state, if its numbers can be used.
     pub fn checked(self) -> Option<Self> {
-        let ok = [self.position_mm, self.direction, self.velocity_mm_s].iter().all(|v| finite(v)) && self.flags <= 3;
+        let ok = [self.position_mm, self.direction, self.velocity_mm_s].iter().all(|v| finite(v))
+            && finite(&self.orientation)
+            && self.flags <= 7;
         ok.then_some(self)
     }
 }

@@ -112,6 +112,8 @@ pub mod segment {
     pub const CUTS: &str = "cuts";
     /// versions of labels; written by the store's writer
     pub const LABELS: &str = "labels";
+    /// versions of the octree's leaves of rewritten bricks; written by the store's writer
+    pub const OCTREE: &str = "octree";
     /// read-only regions, followed by the region's name; written once by the supervisor
     pub const REGION: &str = "region-";
 }

@@ -4,8 +4,8 @@
 
 use iceoryx2::prelude::ZeroCopySend;
 use maille_contract::{
-    BreathLead, BreathState, Commit, ControlBlock, FrameHeader, KnobState, MotionHeader, ServiceCell, Stamp, Switches, ToolCommand,
-    ToolMove, ToolState, UndoCommand, ViewState,
+    BreathLead, BreathState, Commit, ControlBlock, FrameHeader, KnobState, MotionHeader, OctreeHeader, ServiceCell, Stamp, Switches,
+    ToolCommand, ToolMove, ToolState, UndoCommand, ViewState,
     index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
     needle::{LabelsHeader, NeedleDrag, NeedleEvent, NeedleLog, NeedleState},
@@ -50,9 +50,9 @@ fn messages_keep_their_names_sizes_and_offsets() {
 
 #[test]
 fn shared_words_keep_their_sizes_and_offsets() {
-    golden!(ServiceCell, 19_008, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 304, lateness: 9_528, stages: 18_752);
-    golden!(DeviceState, 88, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64);
-    golden!(DeviceForce, 48, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24);
+    golden!(ServiceCell, 19_072, pid: 0, incarnation: 8, restarts: 16, heartbeat_ns: 32, ready_ns: 40, counters: 48, duration: 368, lateness: 9_592, stages: 18_816);
+    golden!(DeviceState, 120, measured_ns: 0, flags: 8, position_mm: 16, direction: 40, velocity_mm_s: 64, orientation: 88);
+    golden!(DeviceForce, 72, sent_ns: 0, sequence: 8, incarnation: 16, force_n: 24, torque_n_mm: 48);
     golden!(KnobState, 152, turns: 0, given_up: 8, turned: 16, values: 24);
     golden!(Switches, 32, stamp: 0, off: 24);
     golden!(UndoCommand, 32, stamp: 0, undos: 24);
@@ -66,19 +66,20 @@ fn shared_words_keep_their_sizes_and_offsets() {
         deepest_mm: 144, path_nodes: 152, path_mm: 160, events: 928);
     golden!(NeedleDrag, 1_560, time_ns: 0, count: 8, radius_mm: 16, path_mm: 24, by_mm: 792);
     golden!(MotionHeader, 16, bytes: 0, storage_error_mm: 8);
+    golden!(OctreeHeader, 16, bytes: 0, tolerance_hu: 8);
     assert_eq!((offset_of!(ControlBlock, magic), align_of::<ControlBlock>()), (0, 64));
     assert_eq!(offset_of!(ControlBlock, size_bytes), 8);
     assert_eq!(offset_of!(ControlBlock, pins) % 64, 0);
     golden!(ChannelLayout, 24, entry_count: 0, slot_count: 8, slot_bytes: 16);
     golden!(SlotRecord, 16, born: 0, superseded: 8);
-    golden!(IndexLayout, 360, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 336, root_count: 344, leaf_count: 352);
-    assert_eq!((size_of::<IndexHeader>(), align_of::<IndexHeader>()), (512, 128));
+    golden!(IndexLayout, 384, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 360, root_count: 368, leaf_count: 376);
+    assert_eq!((size_of::<IndexHeader>(), align_of::<IndexHeader>()), (640, 128));
     assert_eq!(
         (offset_of!(IndexHeader, magic), offset_of!(IndexHeader, checksum), offset_of!(IndexHeader, layout), offset_of!(IndexHeader, head)),
-        (0, 8, 16, 384)
+        (0, 8, 16, 512)
     );
     golden!(SegmentHeader, 32, magic: 0, layout: 8, body_bytes: 16, checksum: 24);
     assert_eq!((BODY_OFFSET, SEGMENT_MAGIC.to_le_bytes()), (4096, *b"mailseg1"));
     golden!(RegionHeader, 104, magic: 0, checksum: 8, kind: 16, header_bytes: 80, body_offset: 88, body_bytes: 96);
-    assert_eq!(Channel::ALL.map(|c| c as usize), [0, 1, 2, 3, 4, 5]);
+    assert_eq!(Channel::ALL.map(|c| c as usize), [0, 1, 2, 3, 4, 5, 6]);
 }

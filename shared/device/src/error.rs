@@ -8,6 +8,8 @@ use thiserror::Error;
 pub enum DeviceError {
     #[error("{library} was not found ({reason}); install {package}, or give the path of the library")]
     LibraryMissing { library: &'static str, package: &'static str, reason: String },
+    #[error("{path} cannot be opened as a library ({reason}); give the path of {library}, which comes with {package}")]
+    LibraryUnusable { path: String, library: &'static str, package: &'static str, reason: String },
     #[error("{library} has no function {function}: it is too old or another library")]
     FunctionMissing { library: String, function: &'static str },
     #[error("{device} is not there: {reason}")]

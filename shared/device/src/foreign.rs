@@ -18,7 +18,7 @@ pub(crate) fn library(
     library: &'static str,
     package: &'static str,
 ) -> Result<(Library, String), DeviceError> {
-    let mut reason = String::new();
+    let mut reason: Option<String> = None;
     let candidates: Vec<&std::ffi::OsStr> = match path {
         Some(path) => vec![path.as_os_str()],
         None => names.iter().map(std::ffi::OsStr::new).collect(),
@@ -28,11 +28,21 @@ pub(crate) fn library(
         // happens once, before any other thread of the device exists.
         match unsafe { Library::new(name) } {
             Ok(opened) => return Ok((opened, name.to_string_lossy().into_owned())),
-            Err(error) if reason.is_empty() => reason = error.to_string(),
-            Err(_) => {}
+            Err(error) => {
+                let error = error.to_string();
+                // that a name is not there says less than what is wrong with one that is
+                let absent = |said: &str| said.starts_with(&*name.to_string_lossy()) && said.contains("cannot open shared object file");
+                if reason.is_none() || !absent(&error) {
+                    reason = Some(error);
+                }
+            }
         }
     }
-    Err(DeviceError::LibraryMissing { library, package, reason })
+    let reason = reason.unwrap_or_default();
+    Err(match path.filter(|path| path.exists()) {
+        Some(path) => DeviceError::LibraryUnusable { path: path.display().to_string(), library, package, reason },
+        None => DeviceError::LibraryMissing { library, package, reason },
+    })
 }
 
 /// Copies a function pointer out of a library.
@@ -59,8 +69,14 @@ pub(crate) mod hd {
     pub const CURRENT_BUTTONS: u32 = 0x2000;
     pub const CURRENT_VELOCITY: u32 = 0x2051;
     pub const CURRENT_TRANSFORM: u32 = 0x2052;
+    pub const OUTPUT_DOF: u32 = 0x2554;
     pub const CURRENT_FORCE: u32 = 0x2700;
+    pub const CURRENT_TORQUE: u32 = 0x2701;
     pub const FORCE_OUTPUT: u32 = 0x4000;
+    /// libHD shortens what is too long a force, where it would refuse it
+    pub const MAX_FORCE_CLAMPING: u32 = 0x4001;
+    /// force is going on, with less than was asked for: warm motors, too large a force or impulse, too fast a hand
+    pub const WARNINGS: std::ops::Range<u32> = 0x0200..0x0300;
     pub const INVALID_HANDLE: u32 = 0xFFFF_FFFF;
     pub const SUCCESS: u32 = 0;
     pub const CALLBACK_DONE: u32 = 0;
@@ -91,11 +107,15 @@ pub(crate) struct Hd {
 pub(crate) struct HdFrame {
     pub device: u32,
     pub force_n: [f64; 3],
+    /// for a device that gives torque [mN·m, which is N·mm]
+    pub torque_n_mm: Option<[f64; 3]>,
     /// 4×4, column by column; translation in mm
     pub transform: [f64; 16],
     pub velocity_mm_s: [f64; 3],
     pub buttons: i32,
     pub error: u32,
+    /// the servo loop has run this; without it nothing above is a reading
+    pub ran: bool,
 }
 
 impl Hd {
@@ -131,14 +151,32 @@ impl Hd {
         unsafe { (self.init_device)(name) }
     }
 
-    /// Enables force and starts the servo loop.
-    pub fn start(&self, device: u32) {
+    /// Enables force and starts the servo loop; how many directions the device gives force and torque in, 6 where it gives torque. The error is the code of
+    /// what failed.
+    pub fn start(&self, device: u32) -> Result<i32, u32> {
         // SAFETY: a handle that `init` gave and that was not disabled since.
         unsafe { (self.make_current)(device) };
+        let mut directions = 0;
+        // SAFETY: room for one integer, as this parameter gives.
+        unsafe { (self.get_integers)(hd::OUTPUT_DOF, &raw mut directions) };
+        // a device that does not tell has none, and that is no error of it
+        self.error();
         // SAFETY: takes a constant of the header.
         unsafe { (self.enable)(hd::FORCE_OUTPUT) };
+        let cannot = self.error();
+        // SAFETY: takes a constant of the header.
+        unsafe { (self.enable)(hd::MAX_FORCE_CLAMPING) };
+        // libraries too old for it keep their own limit
+        self.error();
+        if cannot != hd::SUCCESS {
+            return Err(cannot);
+        }
         // SAFETY: takes nothing; called once for each `stop`.
         unsafe { (self.start_scheduler)() };
+        match self.error() {
+            hd::SUCCESS => Ok(directions),
+            error => Err(error),
+        }
     }
 
     /// Stops the servo loop and lets the device go.
@@ -151,11 +189,15 @@ impl Hd {
 
     /// Sets the force and reads the pose in the servo loop's next turn; returns when it has run, about a millisecond later.
     pub fn exchange(&self, frame: &mut HdFrame) {
-        let mut call = HdCall { hd: self, frame };
+        let mut call = HdCall { hd: self, frame: &mut *frame };
         let call: *mut HdCall<'_> = &raw mut call;
         // SAFETY: the callback has the type that libHD asks for; `call` lives on this stack until the call returns, which is when the
         // callback has run (that is what "synchronous" promises), and nobody else touches it meanwhile.
         unsafe { (self.schedule)(in_servo_loop, call.cast(), hd::DEFAULT_PRIORITY) };
+        if frame.error == hd::SUCCESS {
+            // what the call itself has to say: that there is no servo loop to run in
+            frame.error = self.error();
+        }
     }
 }
 
@@ -173,6 +215,10 @@ extern "C" fn in_servo_loop(data: *mut c_void) -> c_uint {
     unsafe { (hd.begin_frame)(frame.device) };
     // SAFETY: three doubles, as this parameter takes.
     unsafe { (hd.set_doubles)(hd::CURRENT_FORCE, frame.force_n.as_ptr()) };
+    if let Some(torque) = &frame.torque_n_mm {
+        // SAFETY: three doubles, as this parameter takes.
+        unsafe { (hd.set_doubles)(hd::CURRENT_TORQUE, torque.as_ptr()) };
+    }
     // SAFETY: room for sixteen doubles, as this parameter gives.
     unsafe { (hd.get_doubles)(hd::CURRENT_TRANSFORM, frame.transform.as_mut_ptr()) };
     // SAFETY: room for three doubles, as this parameter gives.
@@ -182,6 +228,7 @@ extern "C" fn in_servo_loop(data: *mut c_void) -> c_uint {
     // SAFETY: ends the frame begun above.
     unsafe { (hd.end_frame)(frame.device) };
     frame.error = hd.error();
+    frame.ran = true;
     hd::CALLBACK_DONE
 }
 

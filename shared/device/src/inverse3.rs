@@ -11,8 +11,9 @@ use crate::{
 use bytemuck::Zeroable;
 use serde_json::{Value, json};
 use std::{
+    io::{self, Read, Write},
     net::{TcpStream, ToSocketAddrs},
-    time::Duration,
+    time::{Duration, Instant},
 };
 use tungstenite::{Message, WebSocket};
 
@@ -28,15 +29,17 @@ pub enum Protocol {
     Vector,
 }
 
-/// Longest wait for a connection or a state.
+/// Longest wait for a connection, for the whole of its handshake, and for the whole of an exchange, however many bytes and pings come meanwhile.
 const PATIENCE: Duration = Duration::from_millis(200);
+/// Longest time that saying goodbye may take.
+const GOODBYE: Duration = Duration::from_millis(20);
 const DEVICE: &str = "the Inverse3";
 
 pub(crate) struct Inverse3 {
     address: String,
     protocol: Protocol,
     wanted: Option<String>,
-    socket: Option<WebSocket<TcpStream>>,
+    socket: Option<WebSocket<Timely>>,
     /// what is known since the connection: the device's id and the form of commands
     session: Option<(String, Protocol)>,
 }
@@ -102,6 +105,46 @@ impl Inverse3 {
     }
 }
 
+/// A stream whose reads and writes all end at one moment: a timeout of the socket would begin anew with each byte.
+struct Timely {
+    stream: TcpStream,
+    until: Instant,
+}
+
+impl Timely {
+    fn left(&self) -> io::Result<Duration> {
+        let left = self.until.saturating_duration_since(Instant::now());
+        if left.is_zero() { Err(late()) } else { Ok(left) }
+    }
+}
+
+fn late() -> io::Error {
+    io::Error::new(io::ErrorKind::TimedOut, format!("no answer for {} ms", PATIENCE.as_millis()))
+}
+
+/// A socket that ran out of time says so in two ways.
+fn in_time<T>(done: io::Result<T>) -> io::Result<T> {
+    done.map_err(|error| if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) { late() } else { error })
+}
+
+impl Read for Timely {
+    fn read(&mut self, to: &mut [u8]) -> io::Result<usize> {
+        self.stream.set_read_timeout(Some(self.left()?))?;
+        in_time(self.stream.read(to))
+    }
+}
+
+impl Write for Timely {
+    fn write(&mut self, from: &[u8]) -> io::Result<usize> {
+        self.stream.set_write_timeout(Some(self.left()?))?;
+        in_time(self.stream.write(from))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.stream.flush()
+    }
+}
+
 fn lost(reason: impl ToString) -> DeviceError {
     DeviceError::Lost { device: DEVICE, reason: reason.to_string() }
 }
@@ -112,10 +155,9 @@ impl Driver for Inverse3 {
         let address = self.address.to_socket_addrs().map_err(|e| not_there(e.to_string()))?.next();
         let address = address.ok_or_else(|| not_there(format!("{} is no address", self.address)))?;
         let stream = TcpStream::connect_timeout(&address, PATIENCE).map_err(|e| not_there(e.to_string()))?;
-        stream.set_read_timeout(Some(PATIENCE)).map_err(lost)?;
-        stream.set_write_timeout(Some(PATIENCE)).map_err(lost)?;
         // small messages at once
         stream.set_nodelay(true).map_err(lost)?;
+        let stream = Timely { stream, until: Instant::now() + PATIENCE };
         let (socket, _) = tungstenite::client(format!("ws://{}", self.address), stream).map_err(|e| not_there(e.to_string()))?;
         (self.socket, self.session) = (Some(socket), None);
         Ok(())
@@ -123,6 +165,7 @@ impl Driver for Inverse3 {
 
     fn exchange(&mut self, command: &dyn Fn() -> Command) -> Result<Report, DeviceError> {
         let mut socket = self.socket.take().ok_or_else(|| lost("there is no connection"))?;
+        socket.get_mut().until = Instant::now() + PATIENCE;
         let text = loop {
             match socket.read().map_err(lost)? {
                 Message::Text(text) => break text,
@@ -140,6 +183,7 @@ impl Driver for Inverse3 {
     fn close(&mut self) {
         if let Some(mut socket) = self.socket.take() {
             // who has gone need not be told
+            socket.get_mut().until = Instant::now() + GOODBYE;
             let _ = socket.close(None);
         }
         self.session = None;

@@ -56,6 +56,18 @@ impl Kind {
         Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
 
+    /// From the device's own axes, as its maker has them, to right, up and towards the user.
+    pub fn right_up_towards(self) -> [[f64; 3]; 3] {
+        match self {
+            // those they are (libHD's programmer's guide)
+            Self::Touch => [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            // x towards the user, y right, z up (libdhd)
+            Self::ForceDimension => [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]],
+            // x right, y away from the user, z up (Inverse Service, its default frame)
+            Self::Inverse3 => [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]],
+        }
+    }
+
     /// Its name in scenes and on the command line.
     pub fn name(self) -> &'static str {
         match self {
@@ -79,6 +91,8 @@ pub struct Options {
     pub device: Option<String>,
     /// from the device's frame to the patient's
     pub mounting: Mounting,
+    /// SCHED_FIFO priority of the device's thread, where allowed; 0: none
+    pub priority: i32,
     /// what the device can do; `None`: the kind's usual one ([`profiles`])
     pub profile: Option<DeviceProfile>,
 }
@@ -91,6 +105,7 @@ impl Default for Options {
             library: None,
             device: None,
             mounting: Mounting::default(),
+            priority: 0,
             profile: None,
         }
     }
@@ -103,6 +118,19 @@ pub fn profile(kind: Kind, options: &Options) -> DeviceProfile {
         Kind::Touch => profiles::TOUCH,
         Kind::ForceDimension => profiles::OMEGA,
     })
+}
+
+/// Whether the software that a kind of device needs can be used: the vendor's library opens and has every function. Asks no device, and a device
+/// that is not plugged in is no error. Opening a library runs its initialisers: best in a process that may die of them.
+///
+/// # Errors
+/// As [`open`].
+pub fn usable(kind: Kind, options: &Options) -> Result<(), DeviceError> {
+    match kind {
+        Kind::Inverse3 => Ok(()),
+        Kind::Touch => touch::Touch::load(options).map(drop),
+        Kind::ForceDimension => forcedimension::ForceDimension::load(options).map(drop),
+    }
 }
 
 /// Opens a device. A thread of its own looks for it until it is found, and again whenever it is unplugged; until then it
@@ -121,10 +149,10 @@ pub fn open(kind: Kind, options: &Options) -> Result<RemoteDevice, DeviceError> 
 pub fn open_telling(kind: Kind, options: &Options, tell: impl Fn(&str) + Send + 'static) -> Result<RemoteDevice, DeviceError> {
     let profile = profile(kind, options);
     match kind {
-        Kind::Inverse3 => RemoteDevice::start_telling(inverse3::Inverse3::new(options), profile, options.mounting, tell),
-        Kind::Touch => RemoteDevice::start_telling(touch::Touch::load(options)?, profile, options.mounting, tell),
+        Kind::Inverse3 => RemoteDevice::start_telling(inverse3::Inverse3::new(options), profile, options.mounting, options.priority, tell),
+        Kind::Touch => RemoteDevice::start_telling(touch::Touch::load(options)?, profile, options.mounting, options.priority, tell),
         Kind::ForceDimension => {
-            RemoteDevice::start_telling(forcedimension::ForceDimension::load(options)?, profile, options.mounting, tell)
+            RemoteDevice::start_telling(forcedimension::ForceDimension::load(options)?, profile, options.mounting, options.priority, tell)
         }
     }
 }

@@ -11,20 +11,25 @@ use crate::{DeviceError, Mounting, mounting};
 use bytemuck::{Pod, Zeroable};
 use maille_contact::{Device, DevicePose, DeviceProfile, DeviceStatus};
 use maille_contract::cell::LatestCell;
-use maille_realtime::monotonic_ns;
+use maille_realtime::{enter_realtime, monotonic_ns};
 use std::{
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
     },
     thread::{self, JoinHandle},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 /// A tick that has not written for this long has gone [ns].
 pub const SILENT_NS: u64 = 20_000_000;
+/// An exchange that ends so long after the one before is late: a device at 1 kHz has missed a turn [ns].
+pub const LATE_NS: u64 = 2_000_000;
 /// Pause between two attempts to find a device.
 pub const RETRY: Duration = Duration::from_millis(100);
+/// Longest wait for the thread of a device that is let go: two exchanges of the slowest kind. A library or a name server that hangs does not keep the
+/// process, whose end closes what is open.
+const LET_GO: Duration = Duration::from_millis(500);
 /// Rise of the force after a device came (back) [ns].
 pub const RISE_NS: u64 = 500_000_000;
 
@@ -46,6 +51,8 @@ pub struct Report {
     pub has_velocity: u64,
     /// when it was taken [ns, CLOCK_MONOTONIC]
     pub taken_ns: u64,
+    /// what the device warns of, in its maker's code; 0: nothing
+    pub warning: u64,
 }
 
 /// What a device shall do, in its own frame.
@@ -87,10 +94,12 @@ struct Shared {
     command: LatestCell<COMMAND_WORDS>,
     stop: AtomicBool,
     connected: AtomicBool,
-    /// times it was opened
+    /// times it was opened, and when it was last [ns]
     opened: AtomicU64,
-    /// exchanges so far
+    opened_ns: AtomicU64,
+    /// exchanges so far, and those that came late
     exchanges: AtomicU64,
+    late: AtomicU64,
 }
 
 /// A real device as the tick sees it.
@@ -110,10 +119,11 @@ impl RemoteDevice {
     /// # Errors
     /// When the thread cannot be started.
     pub fn start(driver: impl Driver, profile: DeviceProfile, mounting: Mounting) -> Result<Self, DeviceError> {
-        Self::start_telling(driver, profile, mounting, |_| ())
+        Self::start_telling(driver, profile, mounting, 0, |_| ())
     }
 
-    /// The same; `tell` gets one sentence when the device is not there, is lost, is not ready, and when it is back. It is called on the device's thread.
+    /// The same with SCHED_FIFO of `priority` for the thread (0: none), where that is allowed: who asks for it for the tick is told when it is not. `tell`
+    /// gets one sentence when the device is not there, is lost, is not ready, and when it is back. It is called on the device's thread.
     ///
     /// # Errors
     /// When the thread cannot be started.
@@ -121,6 +131,7 @@ impl RemoteDevice {
         driver: impl Driver,
         profile: DeviceProfile,
         mounting: Mounting,
+        priority: i32,
         tell: impl Fn(&str) + Send + 'static,
     ) -> Result<Self, DeviceError> {
         let shared = Arc::new(Shared {
@@ -129,10 +140,17 @@ impl RemoteDevice {
             stop: AtomicBool::new(false),
             connected: AtomicBool::new(false),
             opened: AtomicU64::new(0),
+            opened_ns: AtomicU64::new(0),
             exchanges: AtomicU64::new(0),
+            late: AtomicU64::new(0),
         });
         let for_thread = Arc::clone(&shared);
-        let thread = thread::Builder::new().name("device".into()).spawn(move || serve(driver, &for_thread, &profile, &tell))?;
+        let serve = move || {
+            // a command that waits for a time slice is felt as a tick that came late
+            drop(enter_realtime(priority, None));
+            serve(driver, &for_thread, &profile, &tell);
+        };
+        let thread = thread::Builder::new().name("device".into()).spawn(serve)?;
         Ok(Self { shared, profile, mounting, last: Report::zeroed(), seen: false, status: DeviceStatus::Unplugged, thread: Some(thread) })
     }
 
@@ -144,6 +162,11 @@ impl RemoteDevice {
     /// Exchanges with the device so far.
     pub fn exchanges(&self) -> u64 {
         self.shared.exchanges.load(Relaxed)
+    }
+
+    /// Exchanges that ended more than [`LATE_NS`] after the one before.
+    pub fn late(&self) -> u64 {
+        self.shared.late.load(Relaxed)
     }
 }
 
@@ -165,6 +188,7 @@ impl Device for RemoteDevice {
         DevicePose {
             position_mm: self.mounting.place(self.last.position_mm),
             direction,
+            // in the patient's millimetres, as the position
             velocity_mm_s: (self.last.has_velocity == 1)
                 .then(|| self.mounting.turn(self.last.velocity_mm_s).map(|v| v * self.mounting.scale)),
             valid: self.status == DeviceStatus::Connected,
@@ -178,7 +202,7 @@ impl Device for RemoteDevice {
     fn write_wrench(&mut self, force_n: [f64; 3], torque_n_mm: [f64; 3]) {
         let command = Command {
             force_n: self.mounting.turn_back(force_n),
-            torque_n_mm: self.mounting.turn_back(torque_n_mm),
+            torque_n_mm: self.mounting.turn_back(torque_n_mm).map(|t| t / self.mounting.scale),
             given_ns: monotonic_ns(),
             reserved: 0,
         };
@@ -198,6 +222,10 @@ impl Device for RemoteDevice {
         if self.seen { monotonic_ns().saturating_sub(self.last.taken_ns) as f64 * 1e-9 } else { f64::INFINITY }
     }
 
+    fn gives(&self) -> f64 {
+        if self.shared.connected.load(Relaxed) { risen(self.shared.opened_ns.load(Relaxed), monotonic_ns()) } else { 0.0 }
+    }
+
     fn status(&self) -> DeviceStatus {
         self.status
     }
@@ -212,8 +240,14 @@ impl Drop for RemoteDevice {
         self.shared.stop.store(true, Relaxed);
         if let Some(thread) = self.thread.take() {
             thread.thread().unpark();
-            // a thread that panicked has let go of its device already
-            let _ = thread.join();
+            let until = Instant::now() + LET_GO;
+            while !thread.is_finished() && Instant::now() < until {
+                thread::sleep(Duration::from_millis(1));
+            }
+            if thread.is_finished() {
+                // one that panicked has let go of its device already
+                let _ = thread.join();
+            }
         }
     }
 }
@@ -263,7 +297,7 @@ impl Said {
 }
 
 fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell: &dyn Fn(&str)) {
-    let mut said = Said::Nothing;
+    let (mut said, mut warned) = (Said::Nothing, 0);
     while !shared.stop.load(Relaxed) {
         if let Err(error) = driver.open() {
             said.away(&error, tell);
@@ -273,13 +307,18 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
         }
         shared.opened.fetch_add(1, Relaxed);
         let began = monotonic_ns();
+        shared.opened_ns.store(began, Relaxed);
+        let mut last_ns = None;
         let opened = Opened(&mut driver, shared);
         while !shared.stop.load(Relaxed) {
             let command = || safe(shared.command.load::<Command>().map(|(command, _)| command), monotonic_ns(), began, profile);
             let mut report = match opened.0.exchange(&command) {
                 Ok(report) => report,
                 Err(error) => {
-                    said.away(&error, tell);
+                    // who is leaving has no more to say of it
+                    if !shared.stop.load(Relaxed) {
+                        said.away(&error, tell);
+                    }
                     break;
                 }
             };
@@ -288,8 +327,17 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
                 shared.report.store(&report);
                 shared.connected.store(true, Relaxed);
                 said.heard(report.ready == 1, profile.name, tell);
+                if report.warning != 0 && report.warning != warned {
+                    let (name, code) = (profile.name, report.warning);
+                    tell(&format!(
+                        "the device ({name}) warns ({code:#06x}: warm motors, or too large a force or too fast a hand for it); its force is lowered"
+                    ));
+                    warned = report.warning;
+                }
             }
             shared.exchanges.fetch_add(1, Relaxed);
+            let late = last_ns.replace(report.taken_ns).is_some_and(|last| report.taken_ns - last > LATE_NS);
+            shared.late.fetch_add(u64::from(late), Relaxed);
         }
         if shared.stop.load(Relaxed) {
             // a device that keeps its last force must not keep this one
@@ -302,10 +350,15 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
     }
 }
 
+/// What part of its force a device gives that was opened then.
+fn risen(opened_ns: u64, now_ns: u64) -> f64 {
+    (now_ns.saturating_sub(opened_ns) as f64 / RISE_NS as f64).min(1.0)
+}
+
 /// The command that the device gets: nothing when the tick is silent, within the profile, and rising after the device came.
 fn safe(given: Option<Command>, now_ns: u64, opened_ns: u64, profile: &DeviceProfile) -> Command {
     let Some(given) = given.filter(|c| now_ns.saturating_sub(c.given_ns) <= SILENT_NS) else { return Command::zeroed() };
-    let rise = (now_ns.saturating_sub(opened_ns) as f64 / RISE_NS as f64).min(1.0);
+    let rise = risen(opened_ns, now_ns);
     let hold = |v: [f64; 3], max: f64| {
         let length = v.iter().map(|c| c * c).sum::<f64>().sqrt();
         if !length.is_finite() || length == 0.0 { [0.0; 3] } else { v.map(|c| c * rise * (max / length).min(1.0)) }
@@ -347,7 +400,7 @@ mod tests {
     fn each_thing_that_happens_to_a_device_is_told_once() {
         let (sender, told) = std::sync::mpsc::channel();
         let tell = move |sentence: &str| drop(sender.send(sentence.to_owned()));
-        let device = RemoteDevice::start_telling(Unsteady { exchanges: 0, opens: 0 }, TOUCH, Mounting::default(), tell).unwrap();
+        let device = RemoteDevice::start_telling(Unsteady { exchanges: 0, opens: 0 }, TOUCH, Mounting::default(), 0, tell).unwrap();
         while device.exchanges() < 40 {
             thread::sleep(Duration::from_millis(5));
         }

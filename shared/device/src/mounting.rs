@@ -1,7 +1,10 @@
-//! How a device stands to the patient: x_patient = c + s R x_device; forces go back by Rᵀ.
+//! How a device stands to the patient: x_patient = c + s R x_device; forces go back by Rᵀ, torques by Rᵀ/s.
 //!
 //! With s ≠ 1 a motion of the hand is drawn larger or smaller; the force is not scaled, so the stiffness at the hand is s times the
-//! tissue's: a coupling made for the device must be divided by s. Units: mm.
+//! tissue's, and a lever of the tool is 1/s longer in the hand: force and torque stay those of one potential, 1/s of the patient's, and a loop in the
+//! hand gives what it takes. A coupling made for the device is divided by s (`HapticConfig::on_scaled_device`). Units: mm.
+
+use crate::Kind;
 
 /// From the device's frame to the patient's.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,12 +24,15 @@ impl Default for Mounting {
     }
 }
 
+/// From axes that are right, up and towards the user to the patient's, who lies before the user on the back with the head to the user's left: right → the
+/// patient's feet (−S), up → anterior (−P), towards the user → the patient's right (−L).
+const BEFORE_THE_USER: [[f64; 3]; 3] = [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]];
+
 impl Mounting {
-    /// A device whose axes are right, up and towards the user (libHD), in front of a patient that lies on the back with the head to
-    /// the user's left: origin at `origin_mm`.
-    pub fn in_front_of_patient(origin_mm: [f64; 3]) -> Self {
-        // right → the patient's feet (−S), up → anterior (−P), towards the user → the patient's right (−L)
-        Self { origin_mm, rotation: [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]], ..Self::default() }
+    /// A device of this kind as it stands on a table, in front of a patient that lies on the back with the head to the user's left: origin at
+    /// `origin_mm`.
+    pub fn in_front_of_patient(kind: Kind, origin_mm: [f64; 3]) -> Self {
+        Self { origin_mm, rotation: product(BEFORE_THE_USER, kind.right_up_towards()), ..Self::default() }
     }
 
     /// R v
@@ -109,7 +115,29 @@ mod tests {
 
     #[test]
     fn the_work_of_a_force_is_the_same_in_both_frames() {
-        let m = Mounting::in_front_of_patient([10.0, 20.0, 30.0]);
+        for kind in Kind::ALL {
+            in_front_is_a_rotation_without_a_scale(Mounting::in_front_of_patient(kind, [10.0, 20.0, 30.0]));
+        }
+    }
+
+    /// Whatever the vendor calls its axes: a hand that goes down goes into a patient on the back, one that goes left goes to the head, and one that goes
+    /// away from the user to the patient's left.
+    #[test]
+    fn the_hand_goes_where_it_goes_whatever_its_device_calls_the_axes() {
+        // down, left, away, as libHD, libdhd and the Inverse Service have them
+        for (kind, [down, left, away]) in [
+            (Kind::Touch, [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+            (Kind::ForceDimension, [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]]),
+            (Kind::Inverse3, [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        ] {
+            let m = Mounting::in_front_of_patient(kind, [0.0; 3]);
+            let moved = [down, left, away].map(|v| m.turn(v).map(|c| c + 0.0));
+            // posterior, superior, left (LPS)
+            assert_eq!(moved, [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], "{kind:?}");
+        }
+    }
+
+    fn in_front_is_a_rotation_without_a_scale(m: Mounting) {
         let (x, f) = ([1.0, -2.0, 0.5], [0.3, 0.7, -1.1]);
         let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         assert!((dot(m.turn(x), f) - dot(x, m.turn_back(f))).abs() < 1e-12);

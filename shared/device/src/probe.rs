@@ -15,7 +15,7 @@ pub struct Finding {
     pub says: String,
 }
 
-/// Looks for all kinds; takes at most half a second.
+/// Looks for all kinds; takes at most some tenths of a second for each.
 pub fn probe(options: &Options) -> Vec<Finding> {
     Kind::ALL.into_iter().map(|kind| probe_kind(kind, options)).collect()
 }

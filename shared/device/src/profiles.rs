@@ -19,6 +19,10 @@ pub const TOUCH: DeviceProfile = DeviceProfile {
     workspace_mm: 75.0,
 };
 
+/// 3D Systems Phantom Premium 1.5 6DOF, with torque: its weakest axis's. Damping and friction as the Touch's, which is cautious.
+pub const PREMIUM: DeviceProfile =
+    DeviceProfile { name: "Premium 6DOF", max_force_n: 8.5, max_torque_n_mm: 170.0, quantum_mm: 0.03, mass_kg: 0.09, ..TOUCH };
+
 /// Force Dimension omega.3, the smallest forces of its family.
 pub const OMEGA: DeviceProfile = DeviceProfile {
     name: "omega",
@@ -56,7 +60,7 @@ pub const INVERSE3: DeviceProfile = DeviceProfile {
 };
 
 /// All profiles, for scenes that name one.
-pub const ALL: [DeviceProfile; 5] = [TOUCH, OMEGA, DELTA, SIGMA, INVERSE3];
+pub const ALL: [DeviceProfile; 6] = [TOUCH, PREMIUM, OMEGA, DELTA, SIGMA, INVERSE3];
 
 /// The profile of this name.
 pub fn named(name: &str) -> Option<DeviceProfile> {

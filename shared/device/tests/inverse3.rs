@@ -1,7 +1,7 @@
 //! inverse3 against a stand-in for the Haply Inverse Service: both forms of its protocol, 1 kHz, unplugged and back in mid-run.
 
 use maille_contact::{Device, DeviceStatus};
-use maille_device::{Kind, Options, Protocol, RemoteDevice, open, probe::probe_kind};
+use maille_device::{Kind, Options, Protocol, RemoteDevice, open, open_telling, probe::probe_kind};
 use maille_realtime::{CountingAllocator, Period, assert_steady, monotonic_ns};
 use serde_json::{Value, json};
 use std::{
@@ -26,6 +26,8 @@ struct Shared {
     plugged: AtomicBool,
     /// the service closes connections
     down: AtomicBool,
+    /// the service says that it lives, and nothing of its device
+    pings: AtomicBool,
     force: Mutex<[f64; 3]>,
     refused: AtomicU64,
     states: AtomicU64,
@@ -80,6 +82,13 @@ impl Drop for Service {
 fn serve(socket: &mut tungstenite::WebSocket<std::net::TcpStream>, new: bool, shared: &Shared) {
     let mut next = monotonic_ns();
     while !shared.stop.load(Relaxed) && !shared.down.load(Relaxed) {
+        if shared.pings.load(Relaxed) {
+            if socket.send(Message::Ping(Default::default())).is_err() {
+                return;
+            }
+            thread::sleep(Duration::from_millis(20));
+            continue;
+        }
         let n = shared.states.fetch_add(1, Relaxed);
         let state = json!({
             "cursor_position": { "x": 0.001 * (n as f64 * 0.01).sin(), "y": 0.02, "z": 0.15 },
@@ -169,6 +178,51 @@ fn an_inverse3_lives_through_unplugging_with_either_form_of_the_protocol() {
             thread::sleep(Duration::from_millis(1));
         }
     }
+}
+
+/// A service that goes on talking without a state, or says its handshake byte by byte, is given up in time: told once, called again, and let go of at once.
+#[test]
+fn a_service_that_talks_and_says_nothing_is_lost_and_called_again() {
+    let service = Service::start(true);
+    let (sender, told) = std::sync::mpsc::channel();
+    let tell = move |sentence: &str| drop(sender.send(sentence.to_owned()));
+    let options = Options { address: service.address.clone(), ..Options::default() };
+    let mut device = open_telling(Kind::Inverse3, &options, tell).unwrap();
+    assert!(ticks(&mut device, 5.0, [0.0; 3], |d| d.status() == DeviceStatus::Connected), "it is found");
+    service.shared.pings.store(true, Relaxed);
+    assert!(ticks(&mut device, 5.0, [0.5, 0.0, 0.0], |d| d.status() == DeviceStatus::Unplugged), "it is missed");
+    assert!(ticks(&mut device, 5.0, [0.5, 0.0, 0.0], |d| d.opened() >= 2), "it is called again");
+    service.shared.pings.store(false, Relaxed);
+    let back = ticks(&mut device, 8.0, [0.5, 0.0, 0.0], |d| d.status() == DeviceStatus::Connected && service.force()[0] == 0.5);
+    assert!(back, "and comes back with its whole force");
+    service.shared.pings.store(true, Relaxed);
+    let began = monotonic_ns();
+    drop(device);
+    assert!(monotonic_ns() - began < 5_000_000_000, "whoever ends does not wait for it");
+    let told: Vec<String> = told.into_iter().collect();
+    assert_eq!(told.iter().filter(|said| said.contains("no answer for 200 ms")).count(), 1, "{told:?}");
+}
+
+#[test]
+fn a_handshake_that_drips_is_given_up() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let dripping = thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut sent = 0;
+        // a byte in time for any timeout that begins anew with each
+        for byte in b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\n".iter().cycle() {
+            if std::io::Write::write_all(&mut stream, &[*byte]).is_err() || sent > 200 {
+                break;
+            }
+            sent += 1;
+            thread::sleep(Duration::from_millis(50));
+        }
+        sent
+    });
+    let found = probe_kind(Kind::Inverse3, &Options { address, ..Options::default() });
+    assert!(!found.software && found.says.contains("no answer for 200 ms"), "{found:?}");
+    assert!(dripping.join().unwrap() < 200, "the connection was given up");
 }
 
 #[test]

@@ -177,6 +177,7 @@ impl Renderer {
             shaded,
             at_eye: shaded && matches!(light, Some(Light::AtEye { .. })),
             warp: extras.warp.is_some(),
+            exact: extras.warp.is_some_and(|warp| twin::exact(warp).is_some()),
             labels: extras.labels.is_some() && table,
             depth: picture.depth.is_some(),
             ends: solids.is_some(),

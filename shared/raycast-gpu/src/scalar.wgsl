@@ -125,6 +125,10 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
             } else if (empty) {
                 way_out = (f32(state) - 1.0) * f32(CELL) / fastest;
             }
+#if EXACT
+            // from where the lattice leads, to where it leads
+            way_out = way_out - 2.0 * lattice.astray / fastest;
+#end
         }
 #else
         let p = at(ray, q);

@@ -46,6 +46,9 @@ impl Renderer {
         overlay: &Overlay<'_>,
         picture: &mut Picture,
     ) -> Result<FrameReport, GpuError> {
+        if overlay.steps > 0 && overlay.warp.is_some() {
+            return Err(GpuError::Unsupported("sections by steps of the fixed point are the CPU's".into()));
+        }
         let (width, height) = (picture.width, picture.height);
         if width * height == 0 || picture.rgb.len() != 3 * width * height {
             return Err(RenderError::Picture { width, height, bytes: picture.rgb.len() }.into());
@@ -84,6 +87,7 @@ impl Renderer {
         } else {
             let variant = Variant {
                 warp: warp.is_some(),
+                exact: warp.is_some_and(|warp| twin::exact(warp).is_some()),
                 labels: labels.is_some(),
                 slab: planes > 1,
                 maximum: section.slab_mode == SlabMode::Maximum,

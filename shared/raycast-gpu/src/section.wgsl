@@ -26,7 +26,7 @@ struct Section {
 
 fn rest_of(p: vec3<f32>) -> vec3<f32> {
 #if WARP
-    return p + offset_at(p);
+    return rest_index(p);
 #else
     return p;
 #end

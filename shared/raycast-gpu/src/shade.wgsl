@@ -40,7 +40,11 @@ fn gradient(place: Place) -> vec3<f32> {
 fn shade(ray: Ray, place: Place, q: f32) -> vec2<f32> {
     var g = gradient(place);
 #if WARP
+#if EXACT
+    g = turned_exactly(g, rest_index(at(ray, q)));
+#else
     g = turned(g, at(ray, q));
+#end
 #end
     let square = dot(g, g);
 #if AT_EYE

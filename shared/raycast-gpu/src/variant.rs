@@ -42,6 +42,8 @@ pub struct Variant {
     pub at_eye: bool,
     /// rays or positions go through a displacement field
     pub warp: bool,
+    /// places are found one by one where a lattice of it does not suffice
+    pub exact: bool,
     /// colours of organs
     pub labels: bool,
     /// depth is asked for
@@ -68,6 +70,7 @@ impl Variant {
             shaded: false,
             at_eye: false,
             warp: false,
+            exact: false,
             labels: false,
             depth: false,
             ends: false,
@@ -84,6 +87,7 @@ impl Variant {
             "SHADED" => self.shaded,
             "AT_EYE" => self.at_eye,
             "WARP" => self.warp,
+            "EXACT" => self.exact,
             "LABELS" => self.labels,
             "DEPTH" => self.depth,
             "ENDS" => self.ends,
@@ -163,6 +167,8 @@ fn constants(layout: &BrickLayout) -> String {
     put(format!("const SLOT_BITS: u32 = {SLOT_BITS}u;\nconst SLOT_MASK: u32 = {}u;", (1u32 << SLOT_BITS) - 1));
     put(format!("const GENTLE: u32 = {GENTLE}u;\nconst REFINEMENTS: i32 = {REFINEMENTS};"));
     put(format!("const TINY: f32 = {TINY:e};\nconst LAST_PIECE: f32 = {LAST_PIECE:e};\nconst ZERO_GRADIENT: f32 = {ZERO_GRADIENT:e};"));
+    let (looks, shortest, folded) = maille_raycast::twin::SETTLE;
+    put(format!("const LOOKS: i32 = {looks};\nconst SHORTEST: f32 = {shortest:e};\nconst FOLDED: f32 = {folded:e};"));
     put(format!("const FAR: f32 = {FAR:e};\nconst NEARLY: f32 = {NEARLY:e};"));
     out
 }
@@ -195,15 +201,27 @@ mod tests {
     fn a_shader_holds_only_what_its_picture_asks_for() {
         let layout = BrickLayout::new([40, 30, 20]);
         let plain = Variant::of(Shows::Volume).source(&layout, 1);
-        for absent in
-            ["lattice", "bent", "offset_at", "label", "solid", "depths", "frame.shading", "fn gradient", "refine", "attenuation", "switch"]
-        {
+        for absent in [
+            "lattice",
+            "bent",
+            "offset_at",
+            "exact",
+            "label",
+            "solid",
+            "depths",
+            "frame.shading",
+            "fn gradient",
+            "refine",
+            "attenuation",
+            "switch",
+        ] {
             assert!(!code(&plain).contains(absent), "{absent} in a plain picture");
         }
         let warped = Variant { warp: true, shaded: true, ..Variant::of(Shows::Both) }.source(&layout, 3);
         for present in ["lattice", "offset_at", "fn gradient", "refine", "switch", "voxels2"] {
             assert!(code(&warped).contains(present), "{present} missing");
         }
+        assert!(!code(&warped).contains("first_node"), "a smooth field's lattice suffices");
         let section = Variant { maximum: true, ..Variant::of(Shows::Section) }.source(&layout, 1);
         for absent in ["Ray", "table", "lattice", "label", "distances", "atan2"] {
             assert!(!code(&section).contains(absent), "{absent} in a section");

@@ -6,7 +6,7 @@
 
 mod common;
 
-use common::{body, difference, gpu, info, warp};
+use common::{body, difference, gpu, info, sliding, warp};
 use maille_raycast::{
     Camera, Capsule, Extras, Geometry, Kernel, Labels, Light, Mode, Overlay, Picture, Plane, Preset, Section, Settings, Shading, Skip,
     SlabMode, Step, Transfer, Warp, render_extra, section_with,
@@ -145,6 +145,10 @@ fn views_through_a_warp_are_those_of_the_cpu() {
     bench.ray("warped x-ray", &out, &Settings::xray(), &extras, false);
     bench.ray("warped endoscope", &inner, &scope(), &Extras { barrel: 0.3, ..extras }, false);
     let labels = organs(&bench.source);
+    let steep: Warp = sliding(&info(&bench.source));
+    let found = Extras { warp: Some(&steep), ..Extras::default() };
+    bench.ray("sliding surface, one by one", &out, &Settings::isosurface(150.0), &found, false);
+    bench.ray("sliding volume, one by one", &out, &tissue(), &found, false);
     bench.ray("warped labels", &out, &tissue(), &Extras { labels: Some(&labels), ..extras }, false);
     bench.end();
 }
@@ -178,6 +182,8 @@ fn sections_are_those_of_the_cpu() {
     bench.flat("largest of a slab", &Section { slab_mm: 7.0, slab_mode: SlabMode::Maximum, ..whole(Plane::Axial) }, &plain);
     bench.flat("labels in a section", &whole(Plane::Axial), &Overlay { labels: Some(&labels), ..plain });
     bench.flat("warped section", &whole(Plane::Coronal), &Overlay { warp: Some(&moved), ..plain });
+    let steep: Warp = sliding(&info);
+    bench.flat("sliding section, one by one", &whole(Plane::Coronal), &Overlay { warp: Some(&steep), ..plain });
     let shown = Overlay { warp: Some(&moved), labels: Some(&labels), displacement_mm: Some(6.0), ..plain };
     bench.flat("displacement and labels in a slab", &Section { slab_mm: 4.0, ..whole(Plane::Coronal) }, &shown);
     let c = info.grid.center();

@@ -60,7 +60,7 @@ impl Faces {
 
 /// Distances from the eye before and after which no ray of a tile meets an occupied cell; the first infinite when none ever does. Nothing is looked at
 /// nearer than `from`.
-pub fn span(frame: &Frame, skip: &Skip, view: Option<&View>, first: [usize; 2], size: [usize; 2], from: f32) -> [f32; 2] {
+pub fn span(frame: &Frame, skip: &Skip, view: Option<&View<'_>>, first: [usize; 2], size: [usize; 2], from: f32) -> [f32; 2] {
     if frame.barrel != 0.0 {
         return [0.0, f32::INFINITY];
     }

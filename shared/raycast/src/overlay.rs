@@ -170,7 +170,7 @@ mod tests {
         }
         let (bricks, _) = block([0.0; 3]);
         let motion = Motion::single(&field).unwrap();
-        let mut warp = Warp::new(bricks.info(), WarpOptions { tolerance_mm: 0.05, pitch_mm: 2.0 });
+        let mut warp = Warp::new(bricks.info(), WarpOptions { pitch_mm: 2.0, ..WarpOptions::default() });
         warp.update(bricks.info(), &motion, &[1.0]).unwrap();
         let at = Section::whole(bricks.info(), Plane::Axial, None, 48, 48);
         let (mut by_inverse, mut by_field) = (Picture::new(48, 48), Picture::new(48, 48));

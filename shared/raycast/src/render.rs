@@ -82,7 +82,7 @@ pub struct Extras<'a> {
     pub labels: Option<&'a Labels>,
     /// solid bodies among the voxels
     pub geometry: Option<&'a Geometry<'a>>,
-    /// surfaces seen from nearer than a pixel a voxel are sampled on the smooth function ([`crate::zoom`]); without effect through a warp
+    /// surfaces seen from nearer than a pixel a voxel are sampled on the smooth function ([`crate::zoom`])
     pub zoom: bool,
     /// barrel distortion k of the lens, at least 0: the ray of a point at radius r (1 at the upper edge) looks along r·(1 + k r²)/(1 + k),
     /// so that the field of view holds at the upper edge and what is further out shrinks
@@ -167,7 +167,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
         let rows = rgb.len() / (3 * width);
         let solid = solids.as_ref().and_then(|s| s.band(n));
         let ends = solid.as_ref().map(|band| Ends { band, row: n * BAND });
-        let mut lens = (extras.zoom && view.is_none()).then(|| Lens::new(&frame, source.info().grid.min_spacing())).flatten();
+        let mut lens = extras.zoom.then(|| Lens::new(&frame, source.info().grid.min_spacing(), extras.warp)).flatten();
         let zoomed = lens.is_some();
         let mut tile = view.as_ref().map(|view| Tile::new(view, TILES));
         for x0 in (0..width).step_by(TILE) {

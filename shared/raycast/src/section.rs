@@ -70,6 +70,9 @@ pub enum SlabMode {
 pub struct Overlay<'a> {
     /// sections of the patient as moved: positions go back to rest by it
     pub warp: Option<&'a Warp>,
+    /// steps of the fixed point that each pixel goes on by from what the warp's lattice says [Fortmeier et al. 2015, section 2.2: five, from nothing]; 0: none, but
+    /// where the lattice does not suffice pixels are found as rays find theirs. The warp must keep its field (`WarpOptions::keep_field`), else there are none
+    pub steps: usize,
     /// colours of organs, at the middle of a slab
     pub labels: Option<&'a Labels>,
     /// displacement of the warp in the plane: hue is its direction, this length [mm] is opaque [Fortmeier et al. 2015, figure 10]
@@ -157,7 +160,7 @@ impl Row {
     }
 
     /// Takes pixels to where they are at rest: as they lie, or all of them through the warp at once.
-    fn places(&mut self, index: impl Fn(f64) -> [f64; 3], warp: Option<&Warp>) {
+    fn places(&mut self, index: impl Fn(f64) -> [f64; 3], warp: Option<&Warp>, steps: usize) {
         for (x, rest) in self.rest.iter_mut().enumerate() {
             *rest = index(x as f64);
         }
@@ -166,6 +169,9 @@ impl Row {
             *world = rest.map(|v| v as f32);
         }
         warp.offsets(&self.world, &mut self.moved);
+        if steps == 0 || !warp.steps(steps, &self.world, &mut self.moved) {
+            warp.settle(&self.world, &mut self.moved);
+        }
         for ((rest, world), moved) in self.rest.iter_mut().zip(&self.world).zip(&self.moved) {
             let moved = moved.to_array();
             *rest = std::array::from_fn(|c| f64::from(world[c] + moved[c]));
@@ -215,11 +221,12 @@ pub fn section_with(source: &(impl BrickSource + ?Sized), section: &Section, ove
                         sampler.index((Vector3::from(section.position(x, y as f64, width, height)) + normal * (t * section.slab_mm)).into())
                     },
                     warp,
+                    overlay.steps,
                 );
                 line.look(&sampler);
             }
             if planes > 1 && (labels.is_some() || overlay.displacement_mm.is_some()) {
-                line.places(|x| sampler.index(section.position(x, y as f64, width, height)), warp);
+                line.places(|x| sampler.index(section.position(x, y as f64, width, height)), warp, overlay.steps);
             }
             for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
                 let Some(hu) = line.value(x, section.slab_mode) else {

@@ -12,6 +12,7 @@ use crate::{
 };
 use maille_volume::BrickSource;
 
+pub use crate::warp::Exact;
 pub use crate::{frame::REFINEMENTS, frame::TINY, scalar::ZERO_GRADIENT, skip::GENTLE, walk::LAST_PIECE};
 
 /// Numbers of one frame; lengths in mm or continuous indices, as in the reference's own frame.
@@ -119,6 +120,14 @@ pub struct Lattice<'a> {
 pub fn lattice(warp: &Warp) -> Lattice<'_> {
     warp.lattice()
 }
+
+/// What rays ask where a warp's lattice does not suffice, and how far from where it leads they may then be [index]; none where it does everywhere.
+pub fn exact(warp: &Warp) -> Option<(Exact<'_>, [f32; 3])> {
+    warp.exact().map(|exact| (exact, warp.astray()))
+}
+
+/// Looks at a field, the shortest part of a step, and the determinant below which there is no step of Newton's.
+pub const SETTLE: (usize, f32, f32) = (crate::warp::LOOKS, crate::warp::SHORTEST, crate::warp::FOLDED);
 
 /// Whether a warp and labels belong to a source: sections leave out those that do not.
 pub fn suits<S: BrickSource + ?Sized>(warp: &Warp, source: &S) -> bool {

@@ -298,7 +298,10 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
         let g = [x, y, lerp(near, far, fy)];
         let g = axes!(c => g[c] * self.l.set(self.frame.per_mm[c] * 0.5 / WEIGHT));
         match &mut self.bend {
-            Some(bend) => bend.turn(self.l, &g, lanes),
+            Some(bend) => {
+                let p = axes!(c => place.base[c].float() + place.fraction[c]);
+                bend.turn(self.l, self.frame, &p, &g, lanes)
+            }
             None => g,
         }
     }
@@ -346,6 +349,35 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
             Some(bend) => bend.bend(self.l, q, alive),
             None => self.rays.at(q),
         }
+    }
+
+    /// Whether some samples are to be found one by one.
+    #[inline(always)]
+    fn is_exact(&self) -> bool {
+        self.bend.as_ref().is_some_and(Bend::is_exact)
+    }
+
+    /// Samples at q that the lattices of a warp take to p, found one by one where those do not suffice and the map's `state` does not say that all around is empty;
+    /// and which lanes those are.
+    #[inline(always)]
+    fn settled(&self, q: L::Float, p: &[L::Float; 3], state: Option<L::Int>, lanes: L::Mask) -> ([L::Float; 3], L::Mask) {
+        let Some(bend) = &self.bend else { return (*p, lanes & !lanes) };
+        let x = self.rays.at(q);
+        let mut rough = bend.rough(self.l, &x, lanes);
+        if let Some(state) = state {
+            rough = rough & !bend.is_far(self.l, self.frame, state, p);
+        }
+        if !rough.any() {
+            return (*p, rough);
+        }
+        (bend.settle(self.l, &x, p, rough), rough)
+    }
+
+    /// [`Self::bent`], and found one by one where that does not suffice.
+    #[inline(always)]
+    fn exactly(&mut self, q: L::Float, alive: L::Mask) -> [L::Float; 3] {
+        let p = self.bent(q, alive);
+        if self.is_exact() { self.settled(q, &p, None, alive).0 } else { p }
     }
 
     /// Steps from samples in empty cells of distance d to where their boxes of empty cells end.
@@ -423,13 +455,22 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
             let q = long.fma(l.set(0.5), from);
             alive = alive & !self.rays.length.lt(q);
             let mut fresh = none;
-            let p = self.bent(q, alive);
-            let (state, corner) = self.state(&p, distances, counts, large);
+            // where lattices lead; the map's answers are given from there, with room for what is astray
+            let led = self.bent(q, alive);
+            let mut p = led;
+            let (mut state, mut corner) = self.state(&p, distances, counts, large);
+            if self.is_exact() {
+                let (found, moved) = self.settled(q, &led, Some(state), alive);
+                if moved.any() {
+                    p = found;
+                    (state, corner) = self.state(&p, distances, counts, large);
+                }
+            }
             let place = self.place(&p);
             let mut empty = state.gt(l.int(0)) & !state.eq(l.int(i32::from(GENTLE)));
             let outside = match &self.bend {
                 Some(bend) => {
-                    let (outside, jump) = outside_lanes(l, frame, bend, &p);
+                    let (outside, jump) = outside_lanes(l, frame, bend, &p, &led);
                     // matter met right after what is outside is cut open, as at the start of a ray
                     fresh = edge & !outside;
                     edge = outside;
@@ -442,7 +483,7 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
             let here = alive & !empty;
             let mut next = from;
             if (alive & empty).any() {
-                let mut out = self.way_out(state, &corner, &p);
+                let mut out = self.way_out(state, &corner, &led);
                 if let Some((outside, jump)) = outside {
                     out = out.or(outside, jump);
                 }
@@ -551,7 +592,7 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
         // matter cut open at the start of the ray faces the light; elsewhere the crossing is found
         let cut = q.lt(l.set(0.75)) | fresh;
         let at = self.refine(q, hit, value).or(cut, q);
-        let p = self.bent(at, hit);
+        let p = self.exactly(at, hit);
         let place = self.place(&p);
         let inner = self.inner(&place);
         let distance = at.fma(l.set(frame.step), self.rays.start);
@@ -583,22 +624,29 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
 
     #[inline(always)]
     fn value_at(&mut self, q: L::Float, lanes: L::Mask) -> L::Float {
-        let p = self.bent(q, lanes);
+        let p = self.exactly(q, lanes);
         let place = self.place(&p);
         let inner = self.inner(&place);
         self.value(&place, &inner)
     }
 }
 
-/// Which lanes the warp has taken out of the volume, and how many steps they stay outside at least.
+/// Which lanes the warp has taken out of the volume, to p, and how many steps they stay outside at least, from where the lattices led.
 #[inline(always)]
-fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::Float; 3]) -> (L::Mask, L::Float) {
+fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::Float; 3], led: &[L::Float; 3]) -> (L::Mask, L::Float) {
     let mut gap = l.set(0.0);
-    for (c, &p) in p.iter().enumerate() {
+    for (c, &p) in led.iter().enumerate() {
         let [forwards, backwards] = bend.slowest()[c];
-        gap = gap.max((l.set(0.0) - p) * forwards).max((p - l.set(frame.last[c])) * backwards);
+        let astray = bend.astray()[c];
+        gap = gap.max((l.set(-astray) - p) * forwards).max((p - l.set(frame.last[c] + astray)) * backwards);
     }
-    (l.set(0.0).lt(gap), gap)
+    let mut outside = l.set(0.0).lt(gap);
+    if bend.is_exact() {
+        for (c, &p) in p.iter().enumerate() {
+            outside = outside | p.lt(l.set(0.0)) | l.set(frame.last[c]).lt(p);
+        }
+    }
+    (outside, gap)
 }
 
 impl Packet {

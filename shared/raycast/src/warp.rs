@@ -8,6 +8,8 @@
 //! X = x + v is put into u, and |x − X − u(X)| / (1 − q) bounds its distance from the true X if u contracts by q. What the picture's
 //! lattice adds is told by [`Warp::view_error_mm`].
 //!
+//! Where lattices err by more than is allowed, a field's kinks and sliding organs, samples are found one by one in the field itself (`rough`, `exact`).
+//!
 //! Empty space stays in rest space: how fast a ray goes there, forwards and backwards along each axis, is bounded for the picture. So the map of
 //! the unwarped volume holds, nothing of it is made anew, and rays jump nearly as far as straight ones (`Bend::way_out`).
 //!
@@ -15,14 +17,18 @@
 //! References, to be compared with: the paper's own scheme ([`Moment::along`]), and the volume [`resampled`]. Not here: where fields come from.
 
 mod bend;
+mod exact;
 mod field;
 mod lattice;
 mod reference;
+mod rough;
 mod settle;
 mod tile;
 mod view;
 
 pub(crate) use bend::Bend;
+pub use exact::Exact;
+pub(crate) use exact::{FOLDED, LOOKS, SHORTEST};
 pub use field::{Moment, Motion, WarpError};
 pub use lattice::{Warp, WarpOptions, WarpReport};
 pub use reference::resampled;

@@ -8,14 +8,18 @@
 //! ([`share`]); depth and colour are mixed by it. Where no crossing lies within a voxel and a half of the hit (thin noise that the function has smoothed away) the
 //! voxels' hit stays.
 //!
-//! Units: HU, mm along the ray; frame: the volume's index space, as everywhere in this crate. Cost: for every 8³ voxels that a tile sees 12 µs to load, then 0.25 µs a
-//! pixel; nothing where no pixel is smaller than a voxel. Not here: silhouettes (a ray that misses the voxels' surface is not asked again), volume modes,
-//! and a patient who breathes, whose rays are bent.
+//! **Through a warp** a place of the ray is first brought to where it is in the patient at rest, by the same lattice as every sample; slopes are turned back by that
+//! map's derivative at the voxels' hit, taken by differences of half a voxel.
+//!
+//! Units: HU, mm along the ray; frame: the volume's index space, as everywhere in this crate. Cost: 0.3 to 0.5 µs a pixel with
+//! all loads, 0.8 to 1.1 µs through a warp (`--example zoom`); nothing where no pixel is smaller than a voxel.
+//! Not here: silhouettes (a ray that misses the voxels' surface is not asked again), and volume modes.
 
 use crate::{
     frame::{Frame, Ray},
     scalar::shade_by,
     settings::Mode,
+    warp::Warp,
 };
 use maille_vif::{Spline, Voxels, Window};
 use maille_volume::BrickSource;
@@ -55,6 +59,8 @@ pub(crate) struct Again {
 /// Gathers the hits of a tile, and looks at them again.
 pub(crate) struct Lens<'a> {
     frame: &'a Frame,
+    /// where a patient who breathes is
+    warp: Option<&'a Warp>,
     /// colour of the surface, and its value (HU)
     color: [f32; 3],
     threshold_hu: f64,
@@ -67,12 +73,12 @@ pub(crate) struct Lens<'a> {
 
 impl<'a> Lens<'a> {
     /// For a picture of a surface; `None` in other modes.
-    pub fn new(frame: &'a Frame, smallest_mm: f64) -> Option<Self> {
+    pub fn new(frame: &'a Frame, smallest_mm: f64, warp: Option<&'a Warp>) -> Option<Self> {
         let Mode::Isosurface { color, threshold_hu } = frame.mode else { return None };
         let tangent = frame.down.iter().map(|d| d * d).sum::<f32>().sqrt();
         let smallest_mm = smallest_mm as f32;
         let per_depth = tangent * frame.scale[1] / smallest_mm;
-        Some(Self { frame, color, threshold_hu, per_depth, smallest_mm, hits: Vec::new(), spline: Spline::default() })
+        Some(Self { frame, warp, color, threshold_hu, per_depth, smallest_mm, hits: Vec::new(), spline: Spline::default() })
     }
 
     /// Takes a hit of the voxels' surface at `depth` [mm] if it is seen from near enough.
@@ -86,7 +92,7 @@ impl<'a> Lens<'a> {
         if q < 0.75 {
             return;
         }
-        let block = place(&ray, q).map(|p| (p.floor() as isize).div_euclid(BLOCK));
+        let block = self.at_rest(place(&ray, q)).map(|p| (p.floor() as isize).div_euclid(BLOCK));
         self.hits.push(Hit { block, x, y, depth, color });
     }
 
@@ -110,14 +116,30 @@ impl<'a> Lens<'a> {
         }
     }
 
+    /// Where a place of the ray is in the patient at rest.
+    fn at_rest(&self, world: [f32; 3]) -> [f32; 3] {
+        self.warp.map_or(world, |warp| warp.rest_index(world))
+    }
+
+    /// Derivatives of that, by places along i, j, k.
+    fn by_world(&self, world: [f32; 3]) -> [[f32; 3]; 3] {
+        std::array::from_fn(|c| {
+            let Some(warp) = self.warp else { return std::array::from_fn(|r| f32::from(u8::from(r == c))) };
+            let to = |by: f32| warp.rest_index(std::array::from_fn(|n| if n == c { world[n] + by } else { world[n] }));
+            let (a, b) = (to(-0.25), to(0.25));
+            std::array::from_fn(|r| 2.0 * (b[r] - a[r]))
+        })
+    }
+
     /// The crossing of the smooth function along a ray near a depth, and its gradient there [HU/mm, the grid's axes].
     fn crossing(&self, ray: &Ray, near: f32) -> Option<(f32, [f32; 3])> {
         let f = self.frame;
         let mut depth = near;
+        let turn = self.by_world(place(ray, (near - ray.start) / f.step));
         for _ in 0..STEPS {
-            let p = place(ray, (depth - ray.start) / f.step);
+            let p = self.at_rest(place(ray, (depth - ray.start) / f.step));
             let (value, by_index) = self.spline.sample(p.map(f64::from))?;
-            let gradient: [f32; 3] = std::array::from_fn(|c| by_index[c] as f32 * f.per_mm[c]);
+            let gradient: [f32; 3] = std::array::from_fn(|c| (0..3).map(|r| by_index[r] as f32 * turn[c][r]).sum::<f32>() * f.per_mm[c]);
             // along the ray; a surface that is met from outside rises
             let slope: f32 = (0..3).map(|c| gradient[c] * ray.direction[c]).sum();
             if slope <= 0.0 {
@@ -144,8 +166,8 @@ fn place(ray: &Ray, q: f32) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Camera, Extras, Picture, Settings, Skip, Step, render_extra};
-    use maille_volume::{BrickedVolume, Grid, Rescale, Volume};
+    use crate::{Camera, Extras, Motion, Picture, Settings, Skip, Step, WarpOptions, render_extra};
+    use maille_volume::{BrickedVolume, Grid, Rescale, VectorField, Volume};
 
     const RADIUS: f64 = 18.0;
 
@@ -170,16 +192,30 @@ mod tests {
     }
 
     fn shot(bricks: &BrickedVolume, from_mm: f64, fov_deg: f64, zoom: bool) -> (Picture, Camera) {
-        let camera = Camera { eye: [0.3 * from_mm, -from_mm, 0.2 * from_mm], target: [0.0; 3], up: [0.0, 0.0, 1.0], fov_deg };
+        shot_through(bricks, None, [0.0; 3], from_mm, fov_deg, zoom)
+    }
+
+    /// The same through a warp, seen from a place moved aside.
+    fn shot_through(
+        bricks: &BrickedVolume,
+        warp: Option<&Warp>,
+        aside: [f64; 3],
+        from_mm: f64,
+        fov_deg: f64,
+        zoom: bool,
+    ) -> (Picture, Camera) {
+        let at = |p: [f64; 3]| std::array::from_fn(|c| p[c] + aside[c]);
+        let eye = at([0.3 * from_mm, -from_mm, 0.2 * from_mm]);
+        let camera = Camera { eye, target: at([0.0; 3]), up: [0.0, 0.0, 1.0], fov_deg };
         let settings = Settings { step: Step::Voxels(0.5), ..Settings::isosurface(500.0) };
         let skip = Skip::new(bricks, &settings);
         let mut picture = Picture::with_depth(96, 96);
-        render_extra(&Extras { zoom, ..Extras::default() }, bricks, &skip, &camera, &settings, &mut picture).unwrap();
+        render_extra(&Extras { zoom, warp, ..Extras::default() }, bricks, &skip, &camera, &settings, &mut picture).unwrap();
         (picture, camera)
     }
 
     /// Mean distance of what is seen from the ball's surface [mm], and how uneven its light is: second differences over two thirds of a voxel.
-    fn errors(picture: &Picture, camera: &Camera) -> (f64, f64) {
+    fn errors(picture: &Picture, camera: &Camera, radius: f64) -> (f64, f64) {
         let [forward, right, up] = camera.frame();
         let tangent = (camera.fov_deg.to_radians() / 2.0).tan();
         let (mut off, mut rough, mut count) = (0.0, 0.0, 0.0);
@@ -188,7 +224,7 @@ mod tests {
                 let u = |v: usize| (2.0 * v as f64 + 1.0) / 96.0 - 1.0;
                 let direction = (forward + right * (u(x) * tangent) - up * (u(y) * tangent)).normalize();
                 let at = nalgebra::Vector3::from(camera.eye) + direction * f64::from(picture.depth.as_ref().unwrap()[y * 96 + x]);
-                off += (at.norm() - RADIUS).abs();
+                off += (at.norm() - radius).abs();
                 let pixel = |dx: isize| f64::from(picture.pixel((x as isize + dx) as usize, y)[0]);
                 rough += (pixel(6) - 2.0 * pixel(0) + pixel(-6)).abs();
                 count += 1.0;
@@ -202,9 +238,33 @@ mod tests {
         let bricks = ball(40.0);
         // a tenth of a voxel a pixel
         let [plain, smooth] = [false, true].map(|zoom| shot(&bricks, 60.0, 13.0, zoom));
-        let ((off, rough), (off_smooth, rough_smooth)) = (errors(&plain.0, &plain.1), errors(&smooth.0, &smooth.1));
+        let ((off, rough), (off_smooth, rough_smooth)) = (errors(&plain.0, &plain.1, RADIUS), errors(&smooth.0, &smooth.1, RADIUS));
         println!("mean distance {off:.4} and {off_smooth:.4} mm, second difference of colours {rough:.2} and {rough_smooth:.2}");
         assert!(off_smooth < 0.7 * off && rough_smooth < 0.7 * rough, "{off} {off_smooth}, {rough} {rough_smooth}");
+    }
+
+    #[test]
+    fn through_a_warp_the_surface_is_seen_as_well_as_without() {
+        let bricks = ball(40.0);
+        let nodes = Grid { origin: [-60.0; 3], ..Grid::axis_aligned([25; 3], [5.0; 3]) };
+        // carried aside; and blown up by a tenth, whose surface is a ball again, of another radius
+        for (aside, grown) in [([4.0, 3.0, -5.0], 0.0), ([0.0; 3], 0.1)] {
+            let mut field = VectorField::zeros(nodes.clone());
+            for n in 0..nodes.voxel_count() {
+                let at = nodes.world_from_index([n % 25, n / 25 % 25, n / 625].map(|v| v as f64));
+                field.vectors[n] = std::array::from_fn(|c| (aside[c] + grown * at[c]) as f32);
+            }
+            let mut warp = Warp::new(bricks.info(), WarpOptions { pitch_mm: 2.0, ..WarpOptions::default() });
+            warp.update(bricks.info(), &Motion::single(&field).unwrap(), &[1.0]).unwrap();
+            let [plain, smooth] = [false, true].map(|zoom| shot_through(&bricks, Some(&warp), aside, 60.0, 13.0, zoom));
+            let own = |(picture, camera): &(Picture, Camera)| {
+                let centered = Camera { eye: std::array::from_fn(|c| camera.eye[c] - aside[c]), target: [0.0; 3], ..*camera };
+                errors(picture, &centered, RADIUS * (1.0 + grown))
+            };
+            let ((off, rough), (off_smooth, rough_smooth)) = (own(&plain), own(&smooth));
+            println!("aside {aside:?}, grown {grown}: {off:.4} and {off_smooth:.4} mm, {rough:.2} and {rough_smooth:.2}");
+            assert!(off_smooth < 0.7 * off && rough_smooth < 0.7 * rough, "{off} {off_smooth}, {rough} {rough_smooth}");
+        }
     }
 
     #[test]

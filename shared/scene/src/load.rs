@@ -7,7 +7,7 @@ use crate::{
     breathing::Signal,
     error::{Fault, SceneError, Source},
     limits::{LIMITS, range_text},
-    organ, recording,
+    organ, pairs, recording,
     registry::{self, CalledBy, KNOBS},
     scene::{EffectSetting, PhantomKind, Scene, Size},
     sections::{Mode, TouchedSurface},
@@ -76,6 +76,10 @@ impl Scene {
         }
         if let Signal::Recorded(file) = &scene.breathing.signal {
             scene.breathing.signal = Signal::Recorded(document.find_file("breathing.signal", file, &folder, "trace of breathing")?);
+        }
+        if let Some(library) = scene.device.library.as_ref().filter(|library| library.components().count() > 1) {
+            // a name alone is looked for where the system has its libraries
+            scene.device.library = Some(document.find_file("device.library", library, &folder, "library")?);
         }
         if let Some(Device::PathFile(file)) = scene.tool.as_ref().map(|t| &t.device) {
             let found = document.find_file("tool.device", file, &folder, "file of way points")?;
@@ -174,6 +178,9 @@ fn read(name: &str, text: &str) -> Result<(Scene, Document), SceneError> {
     check_numbers(&document, &scene, &mut faults);
     check_tool(&document, &scene, &mut faults);
     check_tissues(&document, &scene, &mut faults);
+    for (path, message, label, help) in pairs::faults(&scene, document.span("breathing").is_some()) {
+        faults.push(document.fault(&path, message, label, Some(help)));
+    }
     check_effects(&document, &scene, &mut faults);
     let is_volume = scene.rendering.mode == Mode::Volume;
     for (path, message) in organ::faults(&scene.organs, scene.rendering.alone.as_deref(), is_volume) {
@@ -339,6 +346,19 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some(format!("profiles are {}", PROFILES.join(", ")));
         faults.push(document.fault("device.profile", suggest::unknown("profile", profile, PROFILES), "no such profile", help));
     }
+    if let Some(reason) = scene.device.address.as_deref().and_then(no_address) {
+        let help = Some("write the host and the port of the Haply Inverse Service, as `127.0.0.1:10001` or `[::1]:10001`".into());
+        faults.push(document.fault("device.address", format!("device.address is no address: {reason}"), "no address", help));
+    }
+    let no_name = |text: &str| text.trim().is_empty() || text.contains('\0');
+    if scene.device.id.as_deref().is_some_and(no_name) {
+        let help = Some("write the name that the device was configured with, or leave `id` out for the first there is".into());
+        faults.push(document.fault("device.id", "device.id is no name of a device", "no name", help));
+    }
+    if scene.device.library.as_deref().and_then(Path::to_str).is_some_and(no_name) {
+        let help = Some("write the path of the vendor's shared object, or leave `library` out to have the system find it".into());
+        faults.push(document.fault("device.library", "device.library is no file name", "no file name", help));
+    }
     if let Some(r) = scene.device.rotation {
         let dot = |a: usize, b: usize| (0..3).map(|c| r[a][c] * r[b][c]).sum::<f64>();
         let orthonormal = |a: usize, b: usize| (dot(a, b) - f64::from(u8::from(a == b))).abs() <= 1e-3;
@@ -357,14 +377,6 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         }
     }
     check_finite(document, "device.origin_mm", scene.device.origin_mm, faults);
-    if scene.tool.as_ref().is_some_and(|tool| matches!(tool.shape, Shape::Finger | Shape::Probe)) && !scene.has_effect("palpation") {
-        let help = Some("set `palpation = true` under [effects], or use `shape = \"tip\"`".into());
-        faults.push(document.fault("tool.shape", "a tool with a face needs the effect `palpation`", "needs an effect", help));
-    }
-    if scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Blade) && !scene.has_effect("cutting") {
-        let help = Some("set `cutting = true` under [effects], or hold another tool".into());
-        faults.push(document.fault("tool.kind", "a blade is good for nothing without the effect `cutting`", "needs an effect", help));
-    }
     let smooth = scene.has_effect("smooth-surface");
     if scene.haptic.surface.is_some_and(|surface| surface != TouchedSurface::Interpolated) && !smooth {
         let help = Some("set `smooth-surface = true` under [effects], or leave `surface` out".into());
@@ -374,25 +386,14 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let help = Some("use `shape = \"tip\"` and no needle, or take `smooth-surface` out".into());
         faults.push(document.fault("effects.smooth-surface", "a smooth surface is felt with one ball only", "of no use here", help));
     }
-    let needle = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Needle);
-    if needle != scene.has_effect("needle") {
-        let help = Some("a needle takes `tool.kind = \"needle\"` and `needle = true` under [effects], both".into());
-        let (path, what) = if needle {
-            ("tool.kind", "a needle needs the effect `needle`")
-        } else {
-            ("effects.needle", "the effect `needle` needs a needle to be held")
-        };
-        faults.push(document.fault(path, what, "one of two is missing", help));
-    }
-    let incision = scene.tool.as_ref().is_some_and(|tool| tool.kind == ToolKind::Incision);
-    if incision != scene.has_effect("incision") {
-        let help = Some("an incision takes `tool.kind = \"incision\"` and `incision = true` under [effects], both".into());
-        let (path, what) = if incision {
-            ("tool.kind", "a tool that takes tissue away needs the effect `incision`")
-        } else {
-            ("effects.incision", "the effect `incision` needs a tool that takes tissue away")
-        };
-        faults.push(document.fault(path, what, "one of two is missing", help));
+    if scene.has_effect("octree") && scene.haptic.surface == Some(TouchedSurface::Interpolated) {
+        let help = Some("leave `surface` out, or `octree`".into());
+        faults.push(document.fault(
+            "effects.octree",
+            "nobody looks at an octree where the interpolated voxels are felt",
+            "of no use here",
+            help,
+        ));
     }
     scene.incision.voxels.iter().enumerate().for_each(|(c, &n)| {
         check_range(document, &format!("incision.voxels.{c}"), n as f64, [1.0, 64.0], "voxels", faults);
@@ -426,6 +427,31 @@ fn check_numbers(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
     if scene.memory.spare_mib.is_some() && scene.memory.spare_slots.is_some() {
         let help = Some("keep one of `spare_mib` and `spare_slots`".into());
         faults.push(document.fault("memory.spare_slots", "[memory] gives the spare slots twice", "one of them too many", help));
+    }
+}
+
+/// Why a text is not the host and port of a service; none where it may be one. Whether that host exists shows when it is called.
+fn no_address(text: &str) -> Option<String> {
+    if text.contains("://") {
+        return Some("it has a scheme; the host and port alone are wanted".into());
+    }
+    let Some((host, port)) = text.rsplit_once(':') else { return Some("it has no port".into()) };
+    // colons stand in an IPv6 address, which has brackets
+    let (bare, bracketed) = match host.strip_prefix('[').and_then(|h| h.strip_suffix(']')) {
+        Some(bare) => (bare, true),
+        None => (host, false),
+    };
+    let known = if bracketed {
+        bare.parse::<std::net::Ipv6Addr>().is_ok()
+    } else {
+        !bare.is_empty() && bare.len() <= 253 && bare.chars().all(|c| c.is_ascii_alphanumeric() || "-._".contains(c))
+    };
+    if !known {
+        return Some(format!("`{host}` is no host"));
+    }
+    match port.parse::<u16>() {
+        Ok(1..) => None,
+        _ => Some(format!("`{port}` is no port")),
     }
 }
 

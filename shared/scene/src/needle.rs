@@ -13,7 +13,7 @@ pub struct Needle {
     /// EI as measured [N·mm²]; by default that of a steel tube of the gauge
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bending_n_mm2: Option<f64>,
-    /// nodes of the rod (a knob), 3 to 64
+    /// nodes of the rod (a knob), 3 to 200
     pub nodes: usize,
     /// distance of nodes of the path [mm] (a knob), 2.5 to 20
     pub path_spacing_mm: f64,

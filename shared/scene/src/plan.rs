@@ -12,7 +12,7 @@
 
 use crate::{
     limits,
-    registry::{self, CalledBy, Channel, DISPLACEMENT, Effect, KNOBS, Knob, Process, Stage, VOXELS},
+    registry::{self, CalledBy, Channel, DISPLACEMENT, Effect, KNOBS, Knob, OCTREE, Process, Stage, VOXELS},
     scene::Scene,
 };
 use maille_volume::{
@@ -113,6 +113,10 @@ pub fn plan(scene: &Scene, grid: &Grid, machine: Machine) -> Plan {
     }
     // nothing is ever rewritten without a channel that says by what
     let moves = channels.contains(&&DISPLACEMENT);
+    if !moves {
+        // what is never rewritten has the leaves that it was built with
+        channels.retain(|c| *c != &OCTREE);
+    }
     let dirty_bricks = if moves { largest_dirty_set(scene, grid, &layout) } else { 0 };
     let told = scene.memory.spare_slots.or(scene.memory.spare_mib.map(|mib| ((mib << 20) as usize / VOXELS.brick_bytes).max(8)));
     let spare_slots = if moves { told.unwrap_or((readers + 1) * dirty_bricks) } else { 0 };

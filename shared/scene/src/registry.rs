@@ -67,6 +67,13 @@ pub static CUTS: Channel = Channel {
     brick_bytes: EDGE * EDGE * EDGE,
 };
 
+/// The octree's leaves of bricks that were rewritten: a table, and as many bytes as the blocks' voxels. Where nothing moves there are none.
+pub static OCTREE: Channel = Channel {
+    name: "octree",
+    meaning: "the octree's leaves of rewritten bricks",
+    brick_bytes: 8 + (4 + 2 * 512) * (EDGE / 8) * (EDGE / 8) * (EDGE / 8),
+};
+
 /// A piece of work that runs in a process, by construction of that process's pipeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stage {
@@ -297,6 +304,17 @@ pub static EFFECTS: &[Effect] = &[
         depends_on: &["contact"],
         hard_cases: &["constant values", "a step", "sheets of one voxel", "odd sizes", "commits under the tip"],
         ..Effect::named("smooth-surface", "what is felt (`haptic.surface`) and seen from near is the surface of a smooth function")
+    },
+    Effect {
+        joins: &[Process::Haptic, Process::Deformation],
+        channels: &[&OCTREE],
+        stages: &[stage(Process::Deformation, "octree", Per::Step)],
+        depends_on: &["smooth-surface"],
+        hard_cases: &["constant values", "odd sizes", "commits under the tip", "damaged bytes"],
+        ..Effect::named(
+            "octree",
+            "the smooth function that is felt is of an octree of tri-cubics, kept beside the voxels and refitted by every commit",
+        )
     },
     Effect {
         processes: &[Process::Deformation],

@@ -133,7 +133,7 @@ impl VolumeSection {
 
 /// What the scene says of one effect: on, off, or on with settings of its own.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "an effect is `true`, `false`, or a table of its settings")]
 pub enum EffectSetting {
     /// on or off
     Switch(bool),

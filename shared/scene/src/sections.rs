@@ -146,6 +146,8 @@ pub struct Haptic {
     /// which surface is felt under the effect `smooth-surface`: `"interpolated"`, `"smooth"` (by default) or `"patch"`
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface: Option<TouchedSurface>,
+    /// RMS within which every leaf of the octree is of its voxels, under the effect `octree` [HU], 0 to 1000
+    pub octree_hu: f64,
     /// states put out for others to draw [Hz], 1 to 1000
     pub state_hz: f64,
     /// core on which the loop is kept; by default any
@@ -167,6 +169,7 @@ impl Default for Haptic {
             fade_s: 0.2,
             move_step_mm: 0.1,
             surface: None,
+            octree_hu: 10.0,
             state_hz: 200.0,
             cpu: None,
             priority: 80,

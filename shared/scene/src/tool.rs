@@ -81,10 +81,10 @@ impl RealDevice {
 }
 
 /// Profiles of real devices by name, as `maille_device::profiles` has them.
-pub const PROFILES: &[&str] = &["Touch", "omega", "delta.3", "sigma.7", "Inverse3"];
+pub const PROFILES: &[&str] = &["Touch", "Premium 6DOF", "omega", "delta.3", "sigma.7", "Inverse3"];
 
 /// `[device]`: where a real device is found and how it stands to the patient. Without the table: one device on this machine, its origin at
-/// the tool's first way point, its axes right, up and towards the user, in front of a patient on the back with the head to the user's left.
+/// the tool's first way point, as it stands on a table before its user, in front of a patient on the back with the head to the user's left.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DeviceSection {
@@ -97,18 +97,19 @@ pub struct DeviceSection {
     /// touch: configuration name; inverse3: device id; by default the first
     #[serde(skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
-    /// what it can do, by name: Touch, omega, delta.3, sigma.7, Inverse3; by default the usual one of its kind. For device `"external"`: with a
+    /// what it can do, by name: Touch, Premium 6DOF, omega, delta.3, sigma.7, Inverse3; by default the usual one of its kind. For device `"external"`: with a
     /// profile its limits hold and the passivity controller guards its port; without, only the scene's limits do
     #[serde(skip_serializing_if = "Option::is_none")]
     pub profile: Option<String>,
     /// where the device's origin lies [mm, LPS]; by default at the tool's first way point
     #[serde(skip_serializing_if = "Option::is_none")]
     pub origin_mm: Option<[f64; 3]>,
-    /// from the device's axes to the patient's, row by row, a rotation
+    /// from the device's axes, as its maker has them (libHD: right, up, towards the user; libdhd: towards the user, right, up; Inverse3: right, away from
+    /// the user, up), to the patient's, row by row, a rotation
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rotation: Option<[[f64; 3]; 3]>,
-    /// millimetres in the patient for a millimetre of the hand, 0.1 to 1, by default 1; above 1 the hand would feel a coupling stiffer than
-    /// the one that is stable on its device
+    /// millimetres in the patient for a millimetre of the hand, 0.1 to 1, by default 1: forces stay, so the hand feels tissue `scale` times as stiff.
+    /// Device `"external"` does this to its positions itself and says so here
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
 }

@@ -37,6 +37,29 @@ fn an_unknown_word_is_answered_with_the_words_there_are() {
     assert!(error.to_string().contains("sigma.7") || error.to_string().contains("no profile"), "{error}");
     let error = fault("[device]\nrotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]]");
     assert!(error.to_string().contains("no rotation"), "{error}");
+    for (address, what) in [
+        ("nonsense", "no port"),
+        ("127.0.0.1", "no port"),
+        ("127.0.0.1:", "no port"),
+        ("127.0.0.1:0", "`0` is no port"),
+        ("127.0.0.1:70000", "`70000` is no port"),
+        (":10001", "no host"),
+        ("a host:10001", "no host"),
+        ("::1:10001", "no host"),
+        ("[::g]:10001", "no host"),
+        ("ws://127.0.0.1:10001", "scheme"),
+        ("", "no port"),
+    ] {
+        let error = fault(&format!("[device]\naddress = \"{address}\""));
+        assert!(error.to_string().contains("scene.toml:2: device.address is no address") && error.to_string().contains(what), "{error}");
+    }
+    for address in ["127.0.0.1:10001", "localhost:80", "haply_2.local:65535", "[::1]:10001"] {
+        assert!(Scene::parse("scene.toml", &format!("[device]\naddress = \"{address}\"")).is_ok(), "{address}");
+    }
+    for (key, value) in [("id", "  "), ("id", "Default\\u0000Device"), ("library", ""), ("library", "a\\u0000b")] {
+        let error = fault(&format!("[device]\n{key} = \"{value}\""));
+        assert!(error.to_string().contains(&format!("scene.toml:2: device.{key} is no")), "{error}");
+    }
     for mirrored in [
         "[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]",
         "[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]",
@@ -108,6 +131,36 @@ fn effects_are_known_available_and_not_alone() {
     assert!(error.to_string().contains("unknown key `size`"), "{error}");
     let scene = Scene::parse("ok", "[effects]\nneedle = false\nsections = { enabled = false }").unwrap();
     assert!(!scene.has_effect("needle") && !scene.has_effect("sections"));
+}
+
+/// An effect without its tool, its setting or its table would cost memory and show nothing.
+#[test]
+fn halves_of_a_pair_are_refused_with_what_is_missing() {
+    const TOOL: &str = "[tool]\nradius_mm = 2\n[[tool.path]]\ntime_s = 0\nmm = [0, 0, 0]\n";
+    for (text, says) in [
+        (format!("{TOOL}[effects]\ndeformation = true\ncutting = true"), "needs a blade to be held"),
+        (format!("{TOOL}[effects]\npalpation = true"), "needs a tool with a face"),
+        (TOOL.replace("radius_mm = 2", "kind = \"blade\""), "good for nothing without the effect `cutting`"),
+        (TOOL.replace("radius_mm = 2", "shape = \"finger\""), "needs the effect `palpation`"),
+        (format!("{TOOL}[effects]\ndeformation = true\nrelaxation = true\nplasticity = true"), "needs elastic relaxation"),
+        (
+            format!("{TOOL}[effects]\ndeformation = true\nrelaxation = true\nplasticity = true\n[deformation]\nrelaxation = \"elastic\""),
+            "finds no tissue that is plastic",
+        ),
+        ("[breathing]\nperiod_s = 4".into(), "does not breathe"),
+        (TOOL.replace("radius_mm = 2", "shape = \"shaft\"\nshaft_mm = 41"), "longer than the balls that feel for it"),
+        ("[effects]\nsections = \"yes\"".into(), "an effect is `true`, `false`, or a table of its settings"),
+    ] {
+        let error = fault(&text);
+        assert!(error.to_string().contains(says), "{text}\n{error}");
+        assert!(error.advice().is_some() || text.contains("yes"), "{error}");
+    }
+    let rows =
+        |n: i32| (0..n).map(|k| format!("[[tissue]]\nname = \"t{k}\"\nhu = [{}, {}]\nstiffness_n_per_mm = 1\n", 10 * k, 10 * k + 10));
+    let error = fault(&rows(33).collect::<String>());
+    assert!(error.to_string().contains("33 tissue rows are more than the 32"), "{error}");
+    assert!(Scene::parse("ok", &rows(32).collect::<String>()).is_ok());
+    assert!(Scene::parse("ok", "[effects]\nbreathing = false\n[breathing]\nperiod_s = 4").is_ok());
 }
 
 #[test]

@@ -31,6 +31,11 @@ pub struct Plastic;
 pub struct Cuts;
 /// A label for each voxel.
 pub struct Labels;
+/// The octree's leaves for a brick: a table, and as many bytes as the brick's own voxels have.
+pub struct OctreeLeaves;
+
+/// Bytes of the octree's leaves of a brick: a word and a spare, a word a block of 8³ voxels, and what the blocks' voxels take as they are.
+pub const OCTREE_LEAVES_BYTES: usize = 8 + (4 + 2 * 512) * (EDGE / 8) * (EDGE / 8) * (EDGE / 8);
 
 impl BrickChannel for Displacement {
     type Data = [f32; DISPLACEMENT_LEN];
@@ -47,6 +52,11 @@ impl BrickChannel for Cuts {
 impl BrickChannel for Labels {
     type Data = [u8; BRICK_VOXELS];
     const CHANNEL: Channel = Channel::Labels;
+}
+
+impl BrickChannel for OctreeLeaves {
+    type Data = [u8; OCTREE_LEAVES_BYTES];
+    const CHANNEL: Channel = Channel::Octree;
 }
 
 /// What the store must know of a channel.
@@ -72,4 +82,5 @@ pub(crate) const SPECS: [Spec; CHANNELS] = [
     spec("plastic slots", segment::PLASTIC, DISPLACEMENT_LEN * 4, false),
     spec("cut slots", segment::CUTS, BRICK_VOXELS, false),
     spec("label slots", segment::LABELS, BRICK_VOXELS, false),
+    spec("octree slots", segment::OCTREE, OCTREE_LEAVES_BYTES, true),
 ];

@@ -28,6 +28,8 @@ pub struct StoreSizes {
     pub cut_slots: usize,
     /// slots of labels
     pub label_slots: usize,
+    /// slots of the octree's leaves
+    pub octree_slots: usize,
 }
 
 impl StoreSizes {
@@ -48,6 +50,7 @@ impl StoreSizes {
             plastic_slots: slots(segment::PLASTIC),
             cut_slots: slots(segment::CUTS),
             label_slots: slots(segment::LABELS),
+            octree_slots: slots(segment::OCTREE),
         }
     }
 
@@ -60,6 +63,7 @@ impl StoreSizes {
             Channel::Plastic => self.plastic_slots,
             Channel::Cuts => self.cut_slots,
             Channel::Labels => self.label_slots,
+            Channel::Octree => self.octree_slots,
         }
     }
 }

@@ -21,7 +21,7 @@
 //!
 //! # Layout
 //! Segments (DESIGN D12): the index, rest bricks, brick versions, state, and one for each channel that the plan asks for
-//! ([`Displacement`], [`Plastic`], [`Cuts`], [`Labels`]). The first index points at the rest bricks; what never changes
+//! ([`Displacement`], [`Plastic`], [`Cuts`], [`Labels`], [`OctreeLeaves`]). The first index points at the rest bricks; what never changes
 //! exists once. What else never changes is a [`Region`]. Units and frame are those of `maille-volume`.
 //!
 //! Not here: who may start when (the supervisor), what a brick means (the mapper, the ray caster).
@@ -46,7 +46,7 @@ mod transaction;
 mod writer;
 
 pub use audit::Audit;
-pub use channel::{BRICK_VOXELS, BrickChannel, Cuts, DISPLACEMENT_LEN, Displacement, Labels, Plastic};
+pub use channel::{BRICK_VOXELS, BrickChannel, Cuts, DISPLACEMENT_LEN, Displacement, Labels, OCTREE_LEAVES_BYTES, OctreeLeaves, Plastic};
 pub use keeper::{StoreKeeper, StorePlan};
 pub use layout::{STATE_BYTES, StoreSizes};
 pub use reader::{Reader, RestBricks, Snapshot, volume_info};

@@ -40,18 +40,19 @@ fn volume() -> Volume {
     Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels)
 }
 
-const ALL: StoreSizes = StoreSizes { spare_slots: 60, displacement_slots: 60, plastic_slots: 60, cut_slots: 60, label_slots: 60 };
+const ALL: StoreSizes =
+    StoreSizes { spare_slots: 60, displacement_slots: 60, plastic_slots: 60, cut_slots: 60, label_slots: 60, octree_slots: 60 };
 
 #[test]
 fn a_channel_that_is_not_planned_costs_nothing_and_is_not_there() {
     let sizes = StoreSizes { spare_slots: 8, ..StoreSizes::default() };
     let world = World::new(sizes);
-    for segment in ["displacement", "plastic", "cuts", "labels"] {
+    for segment in ["displacement", "plastic", "cuts", "labels", "octree"] {
         assert!(!world.path(segment).exists(), "{segment}");
     }
     let (small, all) = (StorePlan { info: volume().info, sizes }.segments(), StorePlan { info: volume().info, sizes: ALL }.segments());
     assert_eq!(small.iter().map(|s| s.0).collect::<Vec<_>>(), ["index", "rest", "versions", "state"]);
-    assert_eq!(all.len(), small.len() + 4);
+    assert_eq!(all.len(), small.len() + 5);
     for (name, bytes) in small {
         assert_eq!(world.path(name).metadata().unwrap().len(), bytes as u64, "{name}: the plan says what is made");
     }

@@ -17,7 +17,8 @@ use std::{
     path::PathBuf,
 };
 
-const SIZES: StoreSizes = StoreSizes { spare_slots: 40, displacement_slots: 40, plastic_slots: 40, cut_slots: 40, label_slots: 40 };
+const SIZES: StoreSizes =
+    StoreSizes { spare_slots: 40, displacement_slots: 40, plastic_slots: 40, cut_slots: 40, label_slots: 40, octree_slots: 0 };
 const BRICKS: u32 = 27;
 
 fn volume() -> Volume {

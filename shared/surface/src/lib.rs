@@ -25,5 +25,5 @@ pub use marching_cubes::{Border, marching_cubes, marching_cubes_bricks, marching
 pub use mesh::Mesh;
 pub use organ::{Organ, Selection, SelectionError, organ};
 pub use read::{ReadError, read_mesh};
-pub use vif::{ResolutionError, marching_cubes_patches, marching_cubes_vif};
+pub use vif::{PATCHES_PER_VOXEL, ResolutionError, marching_cubes_patches, marching_cubes_vif};
 pub use write::{write_obj, write_ply, write_stl};

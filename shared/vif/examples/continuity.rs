@@ -8,7 +8,7 @@
 //! Points lie on faces between blocks of different leaves, where the isosurface passes within half a voxel. Step: difference of the two
 //! sides' values over the gradient, in voxels. Turn: angle between the two sides' gradients.
 
-use maille_vif::{LocalSurface, Neighbourhood, Octree, Options, Spline, Voxels, Window, paper_surface};
+use maille_vif::{KeptOctree, Lattice, LocalSurface, Neighbourhood, Octree, Options, Spline, Voxels, Window, paper_surface};
 use maille_volume::{BrickSource, BrickedVolume, io::read_volume};
 use nalgebra::Vector3;
 use std::{path::PathBuf, time::Instant};
@@ -24,6 +24,8 @@ fn main() {
     let (volume, _) = read_volume(&data.join("ct_head_invesalius/cranium_lps.nrrd")).expect("give the folder of data as argument");
     let bricks = BrickedVolume::from_volume(&volume);
     let octree = Octree::build(&bricks, Options::default()).expect("the options are right");
+    let bytes = octree.to_bytes();
+    let kept = KeptOctree::open(&bytes, bricks.info()).expect("they are its own");
     let grid = &bricks.info().grid;
     let spacing = Vector3::from(grid.spacing);
     let mut spline = Spline::default();
@@ -99,22 +101,23 @@ fn main() {
         quantiles("the paper's border following", "µs", &mut paper);
         quantiles("value and gradient of the layer", "µs", &mut sample);
         println!("  of 5000: no patch {missing}, fewer than 25 points {part}; by the paper's 26 directions no patch {paper_missing}");
-        slide(&bricks, iso, &starts);
+        slide("", &Voxels(&bricks), &bricks, iso, &starts);
+        slide(", the function of the octree where its bytes lie", &kept.live(|_| None), &bricks, iso, &starts);
     }
 }
 
 /// Ticks of a tip that slides over the surface from each start: follow, patch, and both.
-fn slide(bricks: &BrickedVolume, iso: f64, starts: &[[f64; 3]]) {
+fn slide(what: &str, lattice: &impl Lattice, bricks: &BrickedVolume, iso: f64, starts: &[[f64; 3]]) {
     let grid = &bricks.info().grid;
     let mut near = Neighbourhood::new(bricks, Window::Five, 1.2 * 1.5 + grid.min_spacing()).expect("a small tip");
     let (mut loads, mut patches, mut ticks) = (Vec::new(), Vec::new(), Vec::new());
     for start in starts.iter().step_by(starts.len() / 400) {
         let mut at = *start;
         // a tip comes to its place through the air: there the neighbourhood is loaded and no patch is asked for
-        near.follow(bricks, 1, at);
+        near.follow(lattice, bricks, 1, at);
         for _ in 0..120 {
             let begin = Instant::now();
-            let loaded = near.follow(bricks, 1, at);
+            let loaded = near.follow(lattice, bricks, 1, at);
             let followed = begin.elapsed();
             let surface = LocalSurface::find(near.spline(), grid, iso, at, 1.5 * grid.min_spacing());
             let all = begin.elapsed();
@@ -130,7 +133,7 @@ fn slide(bricks: &BrickedVolume, iso: f64, starts: &[[f64; 3]]) {
             at = std::array::from_fn(|c| surface.point[c] + 0.1 * step[c] / grid.spacing[c]);
         }
     }
-    println!("  along ways over the surface, {} ticks, {} loads:", ticks.len(), loads.len());
+    println!("  along ways over the surface{what}, {} ticks, {} loads:", ticks.len(), loads.len());
     quantiles("load, where there was one", "µs", &mut loads);
     quantiles("local surface", "µs", &mut patches);
     quantiles("both, tick by tick", "µs", &mut ticks);

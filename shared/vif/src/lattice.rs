@@ -4,6 +4,7 @@
 
 use crate::{
     block::{BLOCK, VOXELS},
+    evaluate::{Tree, block_rows, block_values},
     octree::Octree,
     vector::{Task, widest},
 };
@@ -149,38 +150,67 @@ fn convert(values: &[i16], out: &mut [f32]) {
 }
 
 impl Lattice for Octree {
+    fn info(&self) -> &VolumeInfo {
+        Octree::info(self)
+    }
     fn range(&self, low: [usize; 3], extent: [usize; 3]) -> [f32; 2] {
-        let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
-        let mut values = [0f32; VOXELS];
-        let mut range = [f32::INFINITY, f32::NEG_INFINITY];
-        for bk in low[2] / BLOCK..=(end[2] - 1) / BLOCK {
-            for bj in low[1] / BLOCK..=(end[1] - 1) / BLOCK {
-                for bi in low[0] / BLOCK..=(end[0] - 1) / BLOCK {
-                    let extent = self.block_values([bi * BLOCK, bj * BLOCK, bk * BLOCK], &mut values);
-                    for row in 0..BLOCK * BLOCK {
-                        if row % BLOCK < extent[1] && row / BLOCK < extent[2] {
-                            let row = &values[row * BLOCK..][..extent[0]];
-                            range = row.iter().fold(range, |r, &v| [r[0].min(v), r[1].max(v)]);
-                        }
+        range_of(self, low, extent)
+    }
+    fn read(&self, low: [usize; 3], extent: [usize; 3], row: usize, slice: usize, out: &mut [f32]) {
+        read_of(self, low, extent, [row, slice], out);
+    }
+}
+
+/// [`Lattice::range`] of an octree.
+pub(crate) fn range_of(tree: &(impl Tree + ?Sized), low: [usize; 3], extent: [usize; 3]) -> [f32; 2] {
+    let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
+    let mut values = [0f32; VOXELS];
+    let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+    for bk in low[2] / BLOCK..=(end[2] - 1) / BLOCK {
+        for bj in low[1] / BLOCK..=(end[1] - 1) / BLOCK {
+            for bi in low[0] / BLOCK..=(end[0] - 1) / BLOCK {
+                let extent = block_values(tree, [bi * BLOCK, bj * BLOCK, bk * BLOCK], &mut values);
+                for row in 0..BLOCK * BLOCK {
+                    if row % BLOCK < extent[1] && row / BLOCK < extent[2] {
+                        let row = &values[row * BLOCK..][..extent[0]];
+                        range = row.iter().fold(range, |r, &v| [r[0].min(v), r[1].max(v)]);
                     }
                 }
             }
         }
-        range
     }
-    fn info(&self) -> &VolumeInfo {
-        Octree::info(self)
-    }
-    fn read(&self, low: [usize; 3], extent: [usize; 3], row: usize, slice: usize, out: &mut [f32]) {
+    range
+}
+
+/// [`Lattice::read`] of an octree.
+pub(crate) fn read_of(tree: &(impl Tree + ?Sized), low: [usize; 3], extent: [usize; 3], [row, slice]: [usize; 2], out: &mut [f32]) {
+    widest(ReadTree { tree, low, extent, row, slice, out });
+}
+
+/// Values of a box, block by block.
+struct ReadTree<'a, T: ?Sized> {
+    tree: &'a T,
+    low: [usize; 3],
+    extent: [usize; 3],
+    row: usize,
+    slice: usize,
+    out: &'a mut [f32],
+}
+
+impl<T: Tree + ?Sized> Task for ReadTree<'_, T> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { tree, low, extent, row, slice, out } = self;
         let end: [usize; 3] = std::array::from_fn(|c| low[c] + extent[c]);
         let mut values = [0f32; VOXELS];
         for bk in low[2] / BLOCK..=(end[2] - 1) / BLOCK {
             for bj in low[1] / BLOCK..=(end[1] - 1) / BLOCK {
                 for bi in low[0] / BLOCK..=(end[0] - 1) / BLOCK {
                     let b = [bi * BLOCK, bj * BLOCK, bk * BLOCK];
-                    self.block_values(b, &mut values);
                     let from: [usize; 3] = std::array::from_fn(|c| low[c].max(b[c]));
                     let to: [usize; 3] = std::array::from_fn(|c| end[c].min(b[c] + BLOCK));
+                    block_rows(tree, b, [1, 2].map(|c| from[c] - b[c]..to[c] - b[c]), &mut values);
                     for k in from[2]..to[2] {
                         for j in from[1]..to[1] {
                             let source = ((k - b[2]) * BLOCK + j - b[1]) * BLOCK + from[0] - b[0];

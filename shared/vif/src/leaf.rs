@@ -36,6 +36,29 @@ pub(crate) enum Kind {
 }
 
 impl Kind {
+    /// By its number, as it is stored.
+    #[inline]
+    pub fn from_number(number: u8) -> Option<Self> {
+        [Self::Constant, Self::Cubic8, Self::Cubic16, Self::Cubic32, Self::Packed, Self::Voxels].get(usize::from(number)).copied()
+    }
+
+    /// Whether bytes are enough for a leaf of this kind of a node of `count` voxels, so that reading it stays inside.
+    #[inline]
+    pub fn fits(self, bytes: &[u8], count: usize) -> bool {
+        let needed = match self {
+            Self::Constant => 4,
+            Self::Cubic8 => 8 + TERMS - 1,
+            Self::Cubic16 => 8 + 2 * (TERMS - 1),
+            Self::Cubic32 => 4 * TERMS,
+            Self::Packed => match bytes.get(6) {
+                Some(&bits) if u32::from(bits) <= MOST_BITS => 7 + count * usize::from(bits) / 8 + 3,
+                _ => return false,
+            },
+            Self::Voxels => 2 * count,
+        };
+        bytes.len() >= needed
+    }
+
     /// Whether the leaf holds voxels, not a polynomial.
     pub fn is_raw(self) -> bool {
         matches!(self, Self::Packed | Self::Voxels)
@@ -184,17 +207,55 @@ pub(crate) fn raw_voxel(kind: Kind, bytes: &[u8], n: usize) -> f32 {
     unpack(low, step, word >> shift & ((1 << bits) - 1))
 }
 
+/// Voxels n to n + count − 1 of a raw leaf, all of one row; a whole row of eight that begins on a multiple of eight goes at once, as its bits begin with a byte.
+#[inline(always)]
+pub(crate) fn raw_row(kind: Kind, bytes: &[u8], n: usize, out: &mut [f32]) {
+    if kind == Kind::Voxels {
+        let pairs = bytes[2 * n..2 * (n + out.len())].chunks_exact(2);
+        out.iter_mut().zip(pairs).for_each(|(o, b)| *o = f32::from(i16::from_le_bytes([b[0], b[1]])));
+        return;
+    }
+    let bits = usize::from(bytes[6]);
+    let (begin, half) = (7 + n * bits / 8, 4 * bits);
+    let eight = |at: usize| bytes.get(at..at + 8).map(|b| u64::from_le_bytes(b.try_into().expect("eight bytes")));
+    if let (8, true, Some(a), Some(b)) = (out.len(), n.is_multiple_of(8), eight(begin), eight(begin + half / 8)) {
+        let low = f32::from(i16::from_le_bytes([bytes[0], bytes[1]]));
+        let step = f32::from_le_bytes([bytes[2], bytes[3], bytes[4], bytes[5]]);
+        // four times twelve bits, and four that a byte may begin too early
+        let (b, mask) = (b >> (half % 8), (1u64 << bits) - 1);
+        for x in 0..4 {
+            out[x] = low + step * ((a >> (x * bits)) & mask) as u32 as f32;
+            out[4 + x] = low + step * ((b >> (x * bits)) & mask) as u32 as f32;
+        }
+        return;
+    }
+    out.iter_mut().enumerate().for_each(|(x, o)| *o = raw_voxel(kind, bytes, n + x));
+}
+
 /// All voxels of a cubic leaf's block: values at the 8³ lattice points from `first` on in the node's middle-measured coordinates.
 #[inline(always)]
 pub(crate) fn expand(mean: f32, c: &[f32; TERMS], bases: [&Basis; 3], first: [f64; 3], out: &mut [f32; VOXELS]) {
+    expand_rows(mean, c, bases, first, [0..8, 0..8], out);
+}
+
+/// The same for rows j and k of these ranges only.
+#[inline(always)]
+pub(crate) fn expand_rows(
+    mean: f32,
+    c: &[f32; TERMS],
+    bases: [&Basis; 3],
+    first: [f64; 3],
+    [rows_j, rows_k]: [std::ops::Range<usize>; 2],
+    out: &mut [f32; VOXELS],
+) {
     let tables: [[[f32; DEGREES]; 8]; 3] =
         std::array::from_fn(|a| std::array::from_fn(|x| bases[a].values(first[a] + x as f64).map(|v| v as f32)));
-    for k in 0..8 {
+    for k in rows_k {
         let mut plane = [0f32; 16];
         for d in 0..DEGREES {
             (0..16).for_each(|n| plane[n] += tables[2][k][d] * c[d * 16 + n]);
         }
-        for j in 0..8 {
+        for j in rows_j.clone() {
             let mut line = [0f32; DEGREES];
             for d in 0..DEGREES {
                 (0..DEGREES).for_each(|n| line[n] += tables[1][j][d] * plane[d * DEGREES + n]);

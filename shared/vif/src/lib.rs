@@ -13,11 +13,13 @@
 
 mod bicubic;
 mod block;
+mod brick_leaves;
 mod chunk;
 mod evaluate;
 mod function;
 mod gram;
 mod incision;
+mod kept;
 mod lattice;
 mod leaf;
 mod merge;
@@ -30,9 +32,11 @@ mod vector;
 mod verify;
 
 pub use bicubic::Bicubic;
+pub use brick_leaves::{BRICK_LEAVES_BYTES, Refit};
 pub use evaluate::Jet;
 pub use function::{Function, Interpolated};
 pub use incision::{Carved, Incision, Tool, carve};
+pub use kept::{KeptOctree, LiveOctree, NoOctree};
 pub use lattice::{Lattice, Voxels};
 pub use neighbourhood::Neighbourhood;
 pub use octree::{Field, NodeFit, Octree, Options, SizeTally, Tolerance, Undo, VifError};

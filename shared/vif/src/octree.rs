@@ -95,7 +95,7 @@ pub(crate) struct Bound {
 }
 
 impl Bound {
-    fn new(tolerance: Tolerance, rescale: Rescale) -> Self {
+    pub fn new(tolerance: Tolerance, rescale: Rescale) -> Self {
         let unit = rescale.slope * rescale.slope;
         match tolerance {
             Tolerance::Rms(hu) => Self { per_voxel: hu * hu / unit, whole: 0.0 },
@@ -112,17 +112,17 @@ impl Bound {
 
 /// A leaf larger than a chunk.
 #[derive(Clone, Debug, PartialEq)]
-struct TopLeaf {
-    level: usize,
-    at: [usize; 3],
-    kind: Kind,
-    bytes: Vec<u8>,
+pub(crate) struct TopLeaf {
+    pub level: usize,
+    pub at: [usize; 3],
+    pub kind: Kind,
+    pub bytes: Vec<u8>,
     squared_error: f64,
 }
 
 /// What stands for a chunk.
 #[derive(Clone, Debug, PartialEq)]
-enum Cover {
+pub(crate) enum Cover {
     Own(Leaves),
     /// number of a leaf above
     Top(u32),
@@ -210,9 +210,9 @@ pub struct Octree {
     clamp: Clamp,
     pub(crate) axes: [Axis; 3],
     chunks: [usize; 3],
-    covers: Vec<Cover>,
+    pub(crate) covers: Vec<Cover>,
     top: Top,
-    top_leaves: Vec<TopLeaf>,
+    pub(crate) top_leaves: Vec<TopLeaf>,
 }
 
 /// Where a leaf is and what it holds.

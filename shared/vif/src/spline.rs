@@ -89,6 +89,10 @@ pub struct Spline {
     row: usize,
     slice: usize,
     coefficients: Vec<f32>,
+    /// the values that the coefficients were made from, `wide` of them along each axis, and by which window
+    values: Vec<f32>,
+    wide: [usize; 3],
+    window: Window,
     scratch: [Vec<f32>; 2],
     slope: f64,
     intercept: f64,
@@ -102,13 +106,63 @@ impl Spline {
         (self.first, self.extent, self.slope, self.intercept) = (first, extent, slope, intercept);
         let reach = window.reach();
         let wide = extent.map(|e| e + 2 * reach);
-        let [a, b] = &mut self.scratch;
-        a.resize(wide.iter().product(), 0.0);
+        (self.wide, self.window) = (wide, window);
+        self.values.resize(wide.iter().product(), 0.0);
+        let [b, c] = &mut self.scratch;
         b.resize(wide[0] * wide[1] * extent[2], 0.0);
         (self.row, self.slice) = (wide[0], wide[0] * extent[1]);
+        c.resize(self.slice * extent[2], 0.0);
         self.coefficients.resize(self.slice * extent[2], 0.0);
-        lattice.fill(first.map(|v| v - reach as isize), wide, a);
-        widest(Filter { taps: window.taps(), wide, extent, a, b, out: &mut self.coefficients });
+        lattice.fill(first.map(|v| v - reach as isize), wide, &mut self.values);
+        self.filter();
+    }
+
+    fn filter(&mut self) {
+        let [b, c] = &mut self.scratch;
+        let (taps, wide, extent) = (self.window.taps(), self.wide, self.extent);
+        widest(Filter { taps, wide, extent, a: &self.values, b, c, out: &mut self.coefficients });
+    }
+
+    /// As [`Spline::load`] with the window and extent of the last time, out of a lattice that since then has changed in some boxes (`stale`: first point and extent) only:
+    /// values that are there already are not read again.
+    pub(crate) fn slide(&mut self, lattice: &(impl Lattice + ?Sized), first: [isize; 3], stale: &[([usize; 3], [usize; 3])]) {
+        let (size, reach, wide) = (lattice.info().grid.size, self.window.reach() as isize, self.wide);
+        // beyond the border values repeat: there everything is read
+        let inside = |first: [isize; 3]| (0..3).all(|c| first[c] >= reach && first[c] - reach + wide[c] as isize <= size[c] as isize);
+        let shift: [isize; 3] = std::array::from_fn(|c| first[c] - self.first[c]);
+        if !inside(first) || !inside(self.first) || (0..3).any(|c| shift[c].unsigned_abs() >= wide[c]) {
+            return self.load(lattice, self.window, first, self.extent);
+        }
+        let (row, slice) = (wide[0], wide[0] * wide[1]);
+        let old: [usize; 3] = std::array::from_fn(|c| (self.first[c] - reach) as usize);
+        for (low, extent) in stale {
+            let from: [usize; 3] = std::array::from_fn(|c| low[c].max(old[c]));
+            let to: [usize; 3] = std::array::from_fn(|c| (low[c] + extent[c]).min(old[c] + wide[c]));
+            if (0..3).all(|c| from[c] < to[c]) {
+                let at = (from[2] - old[2]) * slice + (from[1] - old[1]) * row + from[0] - old[0];
+                lattice.read(from, std::array::from_fn(|c| to[c] - from[c]), row, slice, &mut self.values[at..]);
+            }
+        }
+        if shift != [0; 3] {
+            // all in one piece: what so comes from another row or plane is what is read anew below
+            let by = shift[2] * slice as isize + shift[1] * row as isize + shift[0];
+            let count = self.values.len();
+            match by {
+                0.. => self.values.copy_within(by as usize.., 0),
+                _ => self.values.copy_within(..count - by.unsigned_abs(), by.unsigned_abs()),
+            }
+            self.first = first;
+            let new: [usize; 3] = std::array::from_fn(|c| (first[c] - reach) as usize);
+            for c in (0..3).filter(|&c| shift[c] != 0) {
+                let (mut from, mut extent) = (new, wide);
+                extent[c] = shift[c].unsigned_abs();
+                let skipped = if shift[c] > 0 { wide[c] - extent[c] } else { 0 };
+                from[c] += skipped;
+                let at = skipped * [1, row, slice][c];
+                lattice.read(from, extent, row, slice, &mut self.values[at..]);
+            }
+        }
+        self.filter();
     }
 
     /// Loads the box that gives values within `radius` of a point.
@@ -300,8 +354,9 @@ struct Filter<'a> {
     taps: &'a [f32],
     wide: [usize; 3],
     extent: [usize; 3],
-    a: &'a mut [f32],
+    a: &'a [f32],
     b: &'a mut [f32],
+    c: &'a mut [f32],
     out: &'a mut [f32],
 }
 
@@ -309,21 +364,21 @@ impl Task for Filter<'_> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
-        let Self { taps, wide: [wx, wy, _], extent: [ex, ey, ez], a, b, out } = self;
+        let Self { taps, wide: [wx, wy, _], extent: [ex, ey, ez], a, b, c, out } = self;
         let reach = taps.len() - 1;
         debug_assert_eq!(wx, ex + 2 * reach);
         // along k: whole planes
         let plane = wx * wy;
         let count = plane * ez;
         combine(taps, |d| &a[d * plane..][..count], &mut b[..count]);
-        // along j, into the storage of the voxels
+        // along j
         let lines = wx * ey;
         for k in 0..ez {
-            combine(taps, |d| &b[k * plane + d * wx..][..lines], &mut a[k * lines..][..lines]);
+            combine(taps, |d| &b[k * plane + d * wx..][..lines], &mut c[k * lines..][..lines]);
         }
         // along i
         let count = lines * ez - 2 * reach;
-        combine(taps, |d| &a[d..][..count], &mut out[..count]);
+        combine(taps, |d| &c[d..][..count], &mut out[..count]);
     }
 }
 

@@ -39,7 +39,7 @@ impl Octree {
                 for j in (first[1]..last[1]).step_by(BLOCK) {
                     for i in (first[0]..last[0]).step_by(BLOCK) {
                         gather(source, [i, j, k], self.clamp(), &mut block);
-                        self.block_values([i, j, k], &mut values);
+                        crate::evaluate::block_values(self, [i, j, k], &mut values);
                         let [ex, ey, ez] = block.extent;
                         for z in 0..ez {
                             for y in 0..ey {

@@ -31,7 +31,7 @@ pub(super) static CURVES: &[Curve] = &[
              then that of its rays",
         ),
         bench: |c| {
-            let one = |pitch_mm| WarpOptions { tolerance_mm: 0.05, pitch_mm };
+            let one = |pitch_mm| WarpOptions { pitch_mm, ..WarpOptions::default() };
             bench(c, Pitch::Given, &[24.0, 16.0, 8.0, 4.0, 2.0].map(|p: f32| (p, one(p))))
         },
     },

@@ -88,6 +88,10 @@ pub trait Device {
     fn pose_age_s(&self) -> f64 {
         0.0
     }
+    /// What part of the force that is written now it gives: less than 1 while its force rises after it came (back), 0 while it is away.
+    fn gives(&self) -> f64 {
+        1.0
+    }
     /// Whether the device can be counted on, at the last `read`.
     fn status(&self) -> DeviceStatus {
         DeviceStatus::Connected

@@ -48,6 +48,13 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
     // SAFETY: the test gives place for three doubles.
     unsafe { std::ptr::copy_nonoverlapping(wrench.as_ptr(), to, 3) };
 }
+#[unsafe(no_mangle)] pub unsafe extern "C" fn mock_torque(to: *mut c_double) {
+    // in N·mm, as libHD's is
+    let torque = STATE.lock().unwrap().wrench.map(|w| w * 1e3);
+    // SAFETY: the test gives place for three doubles.
+    unsafe { std::ptr::copy_nonoverlapping(torque.as_ptr().add(3), to, 3) };
+}
+#[unsafe(no_mangle)] pub extern "C" fn mock_watchdog() -> c_int { STATE.lock().unwrap().watchdog.into() }
 #[unsafe(no_mangle)] pub extern "C" fn mock_open() -> c_int { c_int::from(STATE.lock().unwrap().open) }
 #[unsafe(no_mangle)]
 pub extern "C" fn mock_move(x: c_double, y: c_double, z: c_double) {

@@ -58,24 +58,46 @@ pub fn body(size: [usize; 3], spacing: [f64; 3]) -> BrickedVolume {
     BrickedVolume::from_volume(&made)
 }
 
-/// Breathing: millimetres along the body, less at the border, some across.
+/// Breathing: millimetres along the body, some across; with room around the body, since a field bends where it ends.
 pub fn motion(info: &VolumeInfo) -> Motion {
     let grid = &info.grid;
-    let mut coarse = grid.clone();
-    coarse.size = grid.size.map(|s| s.div_ceil(3) + 1);
-    coarse.spacing = grid.spacing.map(|s| s * 3.0);
-    let mut field = VectorField::zeros(coarse.clone());
-    let [nx, ny, _] = coarse.size;
+    let mut own = grid.clone();
+    own.size = grid.size.map(|s| s + 24);
+    own.origin = grid.world_from_index([-12.0; 3]);
+    let mut field = VectorField::zeros(own.clone());
+    let [nx, ny, _] = own.size;
     for (n, v) in field.vectors.iter_mut().enumerate() {
-        let at = [n % nx, n / nx % ny, n / (nx * ny)].map(|c| c as f64 / 4.0);
+        let at = [n % nx, n / nx % ny, n / (nx * ny)].map(|c| (c as f64 - 12.0) / 12.0);
         *v = [1.2 * at[1].sin(), 1.0 * at[2].cos(), 4.0 * (0.6 * at[0]).sin()].map(|c| c as f32);
     }
     Motion::single(&field).expect("one field on its own grid")
 }
 
+/// A warp whose lattice suffices.
 pub fn warp(info: &VolumeInfo) -> Warp {
+    let mut warp = Warp::new(info, WarpOptions { pitch_mm: 4.0, ..WarpOptions::default() });
+    let report = warp.update(info, &motion(info), &[1.0]).expect("one coefficient for one field");
+    assert!(report.rough == 0, "{report:?}");
+    warp
+}
+
+/// The same breathing, and halves that slide along each other: a lattice does not suffice there.
+pub fn sliding(info: &VolumeInfo) -> Warp {
+    let grid = &info.grid;
+    let mut coarse = grid.clone();
+    coarse.size = grid.size.map(|s| s.div_ceil(2) + 1);
+    coarse.spacing = grid.spacing.map(|s| s * 2.0);
+    let mut field = VectorField::zeros(coarse.clone());
+    let [nx, ny, _] = coarse.size;
+    for (n, v) in field.vectors.iter_mut().enumerate() {
+        let at = [n % nx, n / nx % ny, n / (nx * ny)].map(|c| c as f64);
+        let slide = 4.0 * (1.2 * (at[0] - 0.4 * nx as f64)).tanh();
+        *v = [(0.3 * at[1]).sin(), (0.4 * at[2]).cos(), slide].map(|c| c as f32);
+    }
+    let motion = Motion::single(&field).expect("one field on its own grid");
     let mut warp = Warp::new(info, WarpOptions::default());
-    warp.update(info, &motion(info), &[1.0]).expect("one coefficient for one field");
+    let report = warp.update(info, &motion, &[1.0]).expect("one coefficient for one field");
+    assert!(report.rough > 0, "{report:?}");
     warp
 }
 

@@ -266,6 +266,11 @@ impl<'a> Lazy<'a> {
 }
 
 impl Lazy<'_> {
+    /// What a step of the first term is worth.
+    pub fn scale(&self) -> f32 {
+        self.terms.first().map_or(0.0, |(_, scale)| *scale)
+    }
+
     #[inline(always)]
     fn node(&self, at: usize) -> f32x4 {
         let mut sum = f32x4::ZERO;

@@ -1,10 +1,12 @@
 //! The inverse on a lattice over the volume, cubic between its nodes.
 //!
-//! Nodes lie `pitch` apart in the volume's index space, from a margin below the volume to one above it. The lattice is
-//! refined, up to `finest`, while its error is above the tolerance.
+//! Nodes lie `pitch` apart in the volume's index space, from a margin below the volume to one above it. Cells in which the lattice errs by more than its share
+//! of the tolerance are *rough* ([`rough`](super::rough)): there whoever asks goes on in the field itself, which is kept for that.
 
+use super::exact::Exact;
 use super::field::{Lazy, Motion, WarpError};
-use super::settle::{Lay, Residual, Settle};
+use super::rough::{Kept, Rough};
+use super::settle::{Lay, Settle};
 use crate::twin::Lattice;
 use maille_displacement::quads::{self, Quads, Task};
 use maille_displacement::{Inverter, RowField, Scheme};
@@ -20,18 +22,23 @@ pub struct WarpOptions {
     pub tolerance_mm: f32,
     /// distance of the lattice's nodes [mm]
     pub pitch_mm: f32,
+    /// whether the moment's field is kept even where the lattice suffices, for steps of one's own ([`Warp::steps`])
+    pub keep_field: bool,
+    /// whether places are found one by one, in the field itself, where the lattice errs by more than its share of the tolerance
+    pub one_by_one: bool,
 }
 
 impl Default for WarpOptions {
     fn default() -> Self {
-        Self { tolerance_mm: 0.05, pitch_mm: 6.0 }
+        Self { tolerance_mm: 0.05, pitch_mm: 6.0, keep_field: false, one_by_one: true }
     }
 }
 
 /// What an update found.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WarpReport {
-    /// bound on a position's distance from its true rest position [mm]; a 3D picture adds [`Warp::view_error_mm`]
+    /// bound on a position's distance from its true rest position [mm]; a 3D picture adds [`Warp::view_error_mm`]. In rough cells places are found one by
+    /// one: there it stands for the residual at which they are
     pub error_mm: f32,
     /// mean of the lattice's error over its cells [mm]
     pub mean_mm: f32,
@@ -43,6 +50,12 @@ pub struct WarpReport {
     pub evaluations: u64,
     /// nodes of the lattice
     pub nodes: usize,
+    /// its cells, and how many of them are rough: there places are found one by one, in the field itself
+    pub cells: usize,
+    /// see `cells`
+    pub rough: usize,
+    /// largest residual that the lattice alone would have, rough cells included [mm]
+    pub lattice_mm: f32,
 }
 
 /// Contraction from which on it says nothing.
@@ -74,6 +87,10 @@ pub struct Warp {
     collapsed: Vec<[i16; 4]>,
     /// moments of v that are known
     known: u8,
+    /// where the lattice does not suffice
+    rough: Rough,
+    /// what the field in `collapsed` is, when it is kept
+    kept: Option<Kept>,
 }
 
 impl Warp {
@@ -92,6 +109,8 @@ impl Warp {
             margin: [0.0; 3],
             collapsed: Vec::new(),
             known: 0,
+            rough: Rough::default(),
+            kept: None,
         }
     }
 
@@ -109,6 +128,11 @@ impl Warp {
             nodes: bytemuck::cast_slice(&self.nodes),
             spacing: self.spacing,
         }
+    }
+
+    /// v [index] of each node, i fastest.
+    pub(super) fn nodes(&self) -> &[f32x4] {
+        &self.nodes
     }
 
     /// The error that was allowed [mm].
@@ -139,13 +163,24 @@ impl Warp {
         // one evaluation a node and one a cell, or few more, of scattered lines of memory for every term, where to form all sums is one stream
         let terms = coefficients.iter().filter(|c| **c != 0.0).count();
         let (scattered, all) = (SCATTERED * self.nodes.len() * terms, field_nodes * (terms + 1));
-        if all > scattered {
-            return Ok(self.invert(&frames, &motion.lazy(coefficients), motion.grid(), contraction));
-        }
         let mut memory = std::mem::take(&mut self.collapsed);
-        let report = self.invert(&frames, &motion.collapse(coefficients, &mut memory), motion.grid(), contraction);
+        let (report, scale) = if all > scattered {
+            let report = self.invert(&frames, &motion.lazy(coefficients), motion.grid(), contraction);
+            // asked one by one, places want the sum itself
+            let scale = if self.wants_field() { motion.collapse(coefficients, &mut memory).scale() } else { 0.0 };
+            (report, scale)
+        } else {
+            let field = motion.collapse(coefficients, &mut memory);
+            (self.invert(&frames, &field, motion.grid(), contraction), field.scale())
+        };
         self.collapsed = memory;
+        self.kept = self.wants_field().then(|| Kept::new(frames, scale, motion.grid()));
         Ok(report)
+    }
+
+    /// Whether somebody will ask the field itself.
+    fn wants_field(&self) -> bool {
+        self.options.keep_field || self.rough.count > 0
     }
 
     /// The inverse of somebody else's field, where it lies: whole numbers of 16 bits at the nodes of `grid`, a step of which is `scale` of its index units; no
@@ -162,7 +197,14 @@ impl Warp {
         contraction: f32,
     ) -> WarpReport {
         self.lay_out(longest_mm);
-        self.invert(&Frames::new(info, grid), &Lazy::one(grid, nodes, scale), grid, contraction)
+        let frames = Frames::new(info, grid);
+        let report = self.invert(&frames, &Lazy::one(grid, nodes, scale), grid, contraction);
+        if self.wants_field() {
+            self.collapsed.resize(nodes.len(), [0; 4]);
+            self.collapsed.copy_from_slice(nodes);
+        }
+        self.kept = self.wants_field().then(|| Kept::new(frames, scale, grid));
+        report
     }
 
     /// Makes room for a motion of this length; what was known is kept when there is room already.
@@ -222,27 +264,73 @@ impl Warp {
         // the new v has taken the place of the one before the last
         std::mem::swap(&mut self.nodes, &mut self.before);
         self.known = (self.known + 1).min(2);
-        let [_, ny, nz] = self.counts.map(|n| n - 1);
-        let rows = (0..ny * nz).into_par_iter().map(|row| {
-            let line = [row % ny, row / ny];
-            quads::run(Residual { field, frames, lay, line, nodes: &self.nodes })
-        });
-        let (worst, sum) = rows.reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1 + b.1));
+        let mut rough = std::mem::take(&mut self.rough);
+        // half of what is allowed is the picture's own
+        let allowed = if self.options.one_by_one { 0.5 * self.options.tolerance_mm } else { f32::INFINITY };
+        let found = rough.look(self, field, frames, lay, allowed);
+        self.rough = rough;
         let bound = 1.0 / (1.0 - q);
         let cells = self.counts.iter().map(|n| n - 1).product::<usize>();
+        let settled = if self.rough.count > 0 { self.stop_mm() } else { 0.0 };
         WarpReport {
-            error_mm: worst * bound,
-            mean_mm: (sum / cells as f64) as f32 * bound,
+            error_mm: found.smooth_mm.max(settled) * bound,
+            mean_mm: (found.sum_mm / cells as f64) as f32 * bound,
             contraction,
             unsettled,
-            evaluations: evaluations + cells as u64,
+            evaluations: evaluations + found.evaluations,
             nodes: self.nodes.len(),
+            cells,
+            rough: self.rough.count,
+            lattice_mm: self.rough.worst_mm,
         }
+    }
+
+    /// Residual at which places that are asked for one by one are found [mm].
+    pub(super) fn stop_mm(&self) -> f32 {
+        0.1 * self.options.tolerance_mm
+    }
+
+    /// The field of the moment, if it is kept.
+    pub(super) fn field(&self) -> Option<(&Kept, Lazy<'_>)> {
+        self.kept.as_ref().map(|kept| (kept, Lazy::one(&kept.grid, &self.collapsed, kept.scale)))
+    }
+
+    /// What rays ask in rough cells; none where there are none.
+    pub(crate) fn exact(&self) -> Option<Exact<'_>> {
+        let kept = self.kept.as_ref().filter(|_| self.rough.count > 0)?;
+        let field = (self.collapsed.as_slice(), kept.scale, kept.grid.size);
+        let cells = (self.rough.cells.as_slice(), self.counts);
+        Some(Exact::new(field, &kept.frames, cells, [self.origin, self.per_pitch], self.stop_mm()))
+    }
+
+    /// How far from the true places, at most, the lattice leads rays in rough cells: twice the worst residual that was seen [index].
+    pub(crate) fn astray(&self) -> [f32; 3] {
+        let mm = if self.rough.count > 0 { 2.0 * self.rough.worst_mm } else { 0.0 };
+        self.spacing.map(|spacing| mm / spacing)
+    }
+
+    /// Whether every cell is rough.
+    pub(super) fn is_rough_everywhere(&self) -> bool {
+        self.rough.everywhere
+    }
+
+    /// Number of the cell that a place [index] lies in.
+    pub(super) fn cell(&self, at: [f32; 3]) -> usize {
+        let [i, j, k] = std::array::from_fn(|c| {
+            let cell = ((at[c] - self.origin[c]) * self.per_pitch[c]).max(0.0) as usize;
+            cell.min(self.counts[c] - 2)
+        });
+        (k * (self.counts[1] - 1) + j) * (self.counts[0] - 1) + i
+    }
+
+    /// Whether the lattice does not suffice at a place of world space [index].
+    pub fn is_rough(&self, world: [f32; 3]) -> bool {
+        self.rough.count > 0 && self.rough.cells[self.cell(world)] != 0
     }
 
     /// v [index] at a position of world space [index]: cubic (Lagrange) in the 4³ nodes around it, beyond the lattice as on its border.
     #[inline]
-    pub(super) fn offset_four(&self, at: [f32; 3]) -> f32x4 {
+    fn offset_four(&self, at: [f32; 3]) -> f32x4 {
         self.cubic(std::array::from_fn(|c| (at[c] - self.origin[c]) * self.per_pitch[c]))
     }
 
@@ -267,7 +355,7 @@ impl Warp {
 
     /// The same at a place among the nodes.
     #[inline(always)]
-    fn cubic(&self, at: [f32; 3]) -> f32x4 {
+    pub(super) fn cubic(&self, at: [f32; 3]) -> f32x4 {
         let (corner, weights) = self.around(at);
         let (row, slice) = (self.counts[0], self.counts[0] * self.counts[1]);
         let x = weights[0].map(f32x4::splat);
@@ -287,6 +375,14 @@ impl Warp {
 
     /// Rest position [index] of a position in world space [index].
     pub fn rest_index(&self, world: [f32; 3]) -> [f32; 3] {
+        let mut v = [self.offset_four(world)];
+        self.settle(&[world], &mut v);
+        let v = v[0].to_array();
+        std::array::from_fn(|c| world[c] + v[c])
+    }
+
+    /// The same of the lattice alone, rough cells or not: what it would be without going on in the field.
+    pub fn lattice_index(&self, world: [f32; 3]) -> [f32; 3] {
         let v = self.offset_four(world).to_array();
         std::array::from_fn(|c| world[c] + v[c])
     }
@@ -331,18 +427,18 @@ impl Task for Offsets<'_> {
 }
 
 #[inline(always)]
-fn three(v: f32x4) -> [f32; 3] {
+pub(super) fn three(v: f32x4) -> [f32; 3] {
     let [x, y, z, _] = v.to_array();
     [x, y, z]
 }
 
 #[inline(always)]
-fn four([x, y, z]: [f32; 3]) -> f32x4 {
+pub(super) fn four([x, y, z]: [f32; 3]) -> f32x4 {
     f32x4::new([x, y, z, 0.0])
 }
 
 /// A row's field, a point at a time.
-struct Single<'a, F>(&'a F);
+pub(super) struct Single<'a, F>(pub &'a F);
 
 impl<F: RowField> maille_displacement::DisplacementField for Single<'_, F> {
     fn at(&self, index: [f32; 3]) -> maille_displacement::FieldSample {
@@ -353,6 +449,7 @@ impl<F: RowField> maille_displacement::DisplacementField for Single<'_, F> {
 }
 
 /// Volume index ↔ field index.
+#[derive(Clone, Debug)]
 pub(super) struct Frames {
     /// columns of the matrix, and what is added
     to_field: [f32x4; 4],
@@ -393,6 +490,21 @@ impl Frames {
     }
 
     /// Of the field's grid [mm].
+    pub fn spacing(&self) -> [f32; 3] {
+        three(self.field_spacing)
+    }
+
+    /// Columns of the matrix to the field's index, and what is added.
+    pub fn columns(&self) -> [[f32; 3]; 4] {
+        self.to_field.map(three)
+    }
+
+    /// Columns of the matrix that takes the field's vectors to the volume's.
+    pub fn columns_back(&self) -> [[f32; 3]; 3] {
+        self.to_volume.map(three)
+    }
+
+    /// [`Self::spacing`], in a register.
     pub fn field_spacing(&self) -> f32x4 {
         self.field_spacing
     }
@@ -410,7 +522,7 @@ impl Frames {
     }
 
     #[inline(always)]
-    fn volume_vector(&self, v: f32x4) -> f32x4 {
+    pub fn volume_vector(&self, v: f32x4) -> f32x4 {
         let ([x, y, z], [a, b, c]) = (three(v), self.to_volume);
         a * f32x4::splat(x) + b * f32x4::splat(y) + c * f32x4::splat(z)
     }

@@ -129,6 +129,37 @@ pub(super) struct Residual<'a> {
     pub lay: Lay,
     pub line: [usize; 2],
     pub nodes: &'a [f32x4],
+    /// what they become, and residuals above which they are what [mm]: [`ROUGH`] above the first, [`DOUBTFUL`] above the second
+    pub cells: &'a mut [u8],
+    pub limits: [f32; 2],
+}
+
+/// A cell that errs by more than it may.
+pub(super) const ROUGH: u8 = 1;
+/// A cell to be looked at more closely where any is rough.
+pub(super) const DOUBTFUL: u8 = 2;
+
+/// What a line's cells err by.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Erring {
+    /// the largest of those that are not rough, and of all [mm]
+    pub smooth_mm: f32,
+    pub worst_mm: f32,
+    pub sum_mm: f64,
+    pub rough: usize,
+    pub evaluations: u64,
+}
+
+impl Erring {
+    pub fn and(self, other: Self) -> Self {
+        Self {
+            smooth_mm: self.smooth_mm.max(other.smooth_mm),
+            worst_mm: self.worst_mm.max(other.worst_mm),
+            sum_mm: self.sum_mm + other.sum_mm,
+            rough: self.rough + other.rough,
+            evaluations: self.evaluations + other.evaluations,
+        }
+    }
 }
 
 /// The nodes that a cell is cubic in, along an axis, and their weights at its middle.
@@ -139,12 +170,11 @@ fn middle(cell: usize, count: usize) -> (usize, [f32; 4]) {
 }
 
 impl Task for Residual<'_> {
-    /// the largest and the sum [mm]
-    type Output = (f32, f64);
+    type Output = Erring;
 
     #[inline(always)]
-    fn run<Q: Quads>(self, q: Q) -> (f32, f64) {
-        let Self { field, frames, lay, line, nodes } = self;
+    fn run<Q: Quads>(self, q: Q) -> Erring {
+        let Self { field, frames, lay, line, nodes, cells, limits: [rough, doubtful] } = self;
         let [nx, ny, nz] = lay.counts;
         let ((j, across), (k, down)) = (middle(line[0], ny), middle(line[1], nz));
         // lines added up, four nodes at a time, the last four again where nx is no multiple of four
@@ -171,7 +201,7 @@ impl Task for Residual<'_> {
         let [start, step] = lay.line(frames, line, 0.5);
         let (start, step, mm) = (q.each(start), q.each(step), q.each(frames.field_spacing().to_array()));
         let to_field = frames.vectors_to_field();
-        let (mut worst, mut total) = (0.0f32, 0.0f64);
+        let mut found = Erring { evaluations: middles.len() as u64, ..Erring::default() };
         for i in (0..middles.len()).step_by(4) {
             let x = q.fma(numbers(q, i), step, start);
             let v = through(q, to_field, q.load(&four(&middles, i)));
@@ -179,11 +209,17 @@ impl Task for Residual<'_> {
             let square = q.mul(off, off);
             let mut out = [[0.0; 4]; 4];
             q.store(q.add(q.add(q.component::<0>(square), q.component::<1>(square)), q.component::<2>(square)), &mut out);
-            for length in out.iter().take(middles.len() - i).map(|square| square[0].sqrt()) {
-                (worst, total) = (worst.max(length), total + f64::from(length));
+            for (length, cell) in out.iter().map(|square| square[0].sqrt()).zip(&mut cells[i..]) {
+                (found.worst_mm, found.sum_mm) = (found.worst_mm.max(length), found.sum_mm + f64::from(length));
+                *cell = if length > doubtful { DOUBTFUL } else { 0 };
+                if length > rough {
+                    (*cell, found.rough) = (ROUGH, found.rough + 1);
+                } else {
+                    found.smooth_mm = found.smooth_mm.max(length);
+                }
             }
         }
-        (worst, total)
+        found
     }
 }
 

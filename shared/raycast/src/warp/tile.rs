@@ -15,7 +15,7 @@ pub(super) fn cubic(t: f32) -> [f32; 4] {
 
 /// Memory for the warp of one tile after the other.
 pub(crate) struct Tile<'a> {
-    pub view: &'a View,
+    pub view: &'a View<'a>,
     /// first pixel
     first: [usize; 2],
     /// nodes across and down
@@ -39,7 +39,7 @@ pub(crate) struct Tile<'a> {
 
 impl<'a> Tile<'a> {
     /// Room for tiles of at most so many pixels.
-    pub fn new(view: &'a View, most: [usize; 2]) -> Self {
+    pub fn new(view: &'a View<'a>, most: [usize; 2]) -> Self {
         let fine = view.fine;
         let room = (most[0].div_ceil(fine) + 1) * (most[1].div_ceil(fine) + 1);
         let planes = view.counts[2];

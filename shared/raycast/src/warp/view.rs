@@ -7,12 +7,16 @@
 //! Error [mm] of that, from differences δ of neighbouring nodes: (|δ²| across, both ways) (fine / pitch)² / 8 + 3/128 |δ⁴| every way + |δ³| along / 125;
 //! what is too coarse, across or along, is made finer while that is above half of the tolerance: packets pay for every slab that they come into. Derivatives ∂v/∂x by central differences of nodes.
 //!
+//! Through a field that the patient's lattice does not suffice for, this one need not either: where it errs by more than it may, slabs are *rough*, and samples in them
+//! are found in the field itself ([`Exact`]), as those in rough cells of the patient's. Nodes then only lead there, and are made finer while a tenth of those looked at
+//! are rough.
+//!
 //! A first, coarse lattice tells how far each tile sees nothing (`beam`); the one that is drawn by has nodes only where tiles look from there on, and its
 //! bound is for those places.
 //!
 //! Units: v in volume indices, pixels, mm from the eye. Cost: one look at the patient's lattice a node.
 
-use super::lattice::Warp;
+use super::{exact::Exact, lattice::Warp};
 use crate::{beam, frame::Frame, skip::Skip};
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -27,8 +31,17 @@ const REFINEMENTS: usize = 4;
 /// Most nodes of a lattice.
 const MOST_NODES: usize = 4 << 20;
 
+/// More than this share of rough nodes, and nodes are made finer.
+const MOST_ROUGH: f64 = 0.1;
+
 /// v along the rays of one picture.
-pub(crate) struct View {
+pub(crate) struct View<'w> {
+    /// what samples in rough slabs and cells ask
+    pub exact: Option<Exact<'w>>,
+    /// how far such samples may lie from where the lattices lead [index]
+    pub astray: [f32; 3],
+    /// of each node, not 0 where what is interpolated there errs by too much; empty where nobody asks
+    rough: Vec<u8>,
     /// pixels between columns
     pub pitch: usize,
     /// pixels between places that are bilinear between each other
@@ -87,7 +100,7 @@ struct Found {
 impl Found {
     /// Looks at a node.
     #[inline]
-    fn look(&mut self, view: &View, steps: [usize; 3], n: usize, mm: f32x4) {
+    fn look(&mut self, view: &View<'_>, steps: [usize; 3], n: usize, mm: f32x4) {
         let two = f32x4::splat(2.0);
         let v = |a: usize, m: isize| view.nodes[n.wrapping_add_signed(m * steps[a] as isize)];
         let length = |v: f32x4| {
@@ -136,9 +149,16 @@ pub(crate) struct Hull {
     pub high: [f32; 3],
 }
 
-impl View {
+/// What nodes say together.
+struct Measured {
+    errors: Errors,
+    /// share of rough nodes
+    rough: f64,
+}
+
+impl<'w> View<'w> {
     /// The lattice of a picture of this size, drawn by tiles. Where its empty space is known, nodes are made only where rays go on through the volume.
-    pub fn new(warp: &Warp, frame: &Frame, skip: Option<&Skip>, size: [usize; 2], tile: [usize; 2]) -> Self {
+    pub fn new(warp: &'w Warp, frame: &Frame, skip: Option<&Skip>, size: [usize; 2], tile: [usize; 2]) -> Self {
         let (mut pitch, mut apart) = (PIXELS, PLANES_MM);
         let allowed = 0.5 * warp.tolerance_mm();
         let mut tiles = tiles(size, tile);
@@ -148,33 +168,37 @@ impl View {
                 && let Some(skip) = skip
             {
                 // coarse nodes tell where tiles see anything, and of those what they err by
-                view.measure(frame, &tiles);
+                view.measure(frame, &tiles, allowed);
                 tiles.par_iter_mut().for_each(|tile| tile.span = beam::span(frame, skip, Some(&view), tile.first, tile.size, 0.0));
             }
-            let Errors { across, along, both } = view.measure(frame, &tiles);
+            let Measured { errors: Errors { across, along, both }, rough } = view.measure(frame, &tiles, allowed);
             // the fewest steps with which columns are near enough to one another
             let most = STEPS.len() - 1;
             let steps = (0..most).find(|&n| across[n] <= 0.5 * allowed && STEPS[n] <= pitch).unwrap_or(most);
             view.fine = (pitch / STEPS[steps]).max(1);
             view.error_mm = both[steps];
             let finer = 4 * view.nodes.len() < MOST_NODES && refinement < REFINEMENTS;
-            if view.error_mm <= allowed || !finer {
+            // where all samples are found one by one anyway, nodes need only lead there
+            let few = rough <= MOST_ROUGH || warp.is_rough_everywhere();
+            if (view.error_mm <= allowed && few) || !finer {
                 view.turn(frame, &tiles);
                 view.tiles = tiles;
                 return view;
             }
-            if across[most] > 0.5 * allowed {
+            if across[most] > 0.5 * allowed || !few {
                 pitch = (pitch / 2).max(STEPS[0]);
             }
             if along > 0.5 * allowed {
                 // the error along rays falls as the cube of the planes' distance, at first
                 apart *= (0.4 * allowed / along).cbrt().clamp(0.25, 0.8);
+            } else if !few {
+                apart *= 0.5;
             }
         }
         unreachable!("it ends at the last refinement")
     }
 
-    fn of(warp: &Warp, frame: &Frame, tiles: &[Seen], size: [usize; 2], pitch: usize, apart: f32) -> Self {
+    fn of(warp: &'w Warp, frame: &Frame, tiles: &[Seen], size: [usize; 2], pitch: usize, apart: f32) -> Self {
         let [near, far] = Self::range(frame);
         // no plane through the eye itself, where columns meet
         let first = if near < apart { 0.5 * apart } else { near };
@@ -187,6 +211,9 @@ impl View {
         ];
         let [nx, ny, nz] = counts;
         let mut view = Self {
+            exact: warp.exact(),
+            astray: warp.astray(),
+            rough: Vec::new(),
             pitch,
             fine: pitch,
             first,
@@ -234,32 +261,73 @@ impl View {
         reach
     }
 
-    /// What the lattice errs by where tiles look; sets how steep and how bent v is there.
-    fn measure(&mut self, frame: &Frame, tiles: &[Seen]) -> Errors {
+    /// What the lattice errs by where tiles look; sets how steep and how bent v is there, and, where samples can be found one by one, which nodes err by more
+    /// than `allowed` [mm]: those are left out of the errors, and say how far samples may be astray.
+    fn measure(&mut self, frame: &Frame, tiles: &[Seen], allowed: f32) -> Measured {
         let [nx, ny, nz] = self.counts;
         let directions = self.directions(frame);
         let reach = self.reach(tiles, 1);
         let mm = f32x4::new([1.0 / frame.per_mm[0], 1.0 / frame.per_mm[1], 1.0 / frame.per_mm[2], 0.0]);
         let view = &*self;
+        let parted = view.exact.is_some();
+        let most = STEPS.len() - 1;
         let found = (2..nz - 2).into_par_iter().map(|k| {
-            let mut found = Found::default();
+            let (mut found, mut rough, mut looked, mut worst) = (Found::default(), Vec::new(), 0, 0.0f32);
             for (j, i) in (2..ny - 2).flat_map(|j| (2..nx - 2).map(move |i| (j, i))) {
                 let column = j * nx + i;
                 let [from, to] = reach[column];
                 if k >= from && k <= to && view.near(frame, view.place(frame, &directions[column], k)) {
-                    found.look(view, [1, nx, nx * ny], k * nx * ny + column, mm);
+                    let n = k * nx * ny + column;
+                    if !parted {
+                        found.look(view, [1, nx, nx * ny], n, mm);
+                        continue;
+                    }
+                    let mut one = Found::default();
+                    one.look(view, [1, nx, nx * ny], n, mm);
+                    looked += 1;
+                    if one.errors.both[most] > allowed {
+                        rough.push(n);
+                        worst = worst.max(one.errors.both[most]);
+                        one.errors = Errors::default();
+                    }
+                    found = found.larger(one);
                 }
             }
-            found
+            (found, rough, looked, worst)
         });
-        let found = found.reduce(Found::default, Found::larger);
+        let (found, rough, looked, worst) = found.reduce(
+            || (Found::default(), Vec::new(), 0, 0.0),
+            |mut a, mut b| {
+                a.1.append(&mut b.1);
+                (a.0.larger(b.0), a.1, a.2 + b.2, a.3.max(b.3))
+            },
+        );
+        if parted {
+            self.rough = vec![0; nx * ny * nz];
+            rough.iter().for_each(|&n| self.rough[n] = 1);
+            self.astray = std::array::from_fn(|c| self.astray[c].max(worst * frame.per_mm[c]));
+        }
         // a fifth more, for what lies between nodes
         let [x, y, z, _] = found.steepest.to_array();
         self.steepest = [x, y, z].map(|s| 1.2 * s);
         // cubics and parabolas leave the line by an eighth of the second difference, cubics of cubics by a quarter more each
         let [x, y, z, _] = found.bent.to_array();
         self.bulge = [x, y, z].map(|b| 1.2 * 1.25 * 1.25 / 8.0 * b);
-        found.errors
+        Measured { errors: found.errors, rough: rough.len() as f64 / f64::from(looked.max(1)) }
+    }
+
+    /// Whether samples of a slab, in the columns around pixels from one to another, are to be found one by one.
+    pub fn is_rough(&self, slab: usize, [first, last]: [[usize; 2]; 2]) -> bool {
+        if self.rough.is_empty() {
+            return false;
+        }
+        let [nx, ny, _] = self.counts;
+        let column = |pixel: usize, c: usize| (pixel / self.pitch + 1).min(self.counts[c] - 2);
+        let columns = column(first[0], 0)..=column(last[0], 0) + 1;
+        (slab + 1..slab + 3).any(|k| {
+            let mut rows = column(first[1], 1)..=column(last[1], 1) + 1;
+            rows.any(|j| columns.clone().any(|i| self.rough[(k * ny + j) * nx + i] != 0))
+        })
     }
 
     /// Of a tile, from its number, row by row: the distances from the eye between which its rays may see something [mm].
@@ -267,7 +335,7 @@ impl View {
         self.tiles[tile].span
     }
 
-    /// Least and largest v of the nodes around a tile in plane k, the bulge included.
+    /// Least and largest v of the nodes around a tile in plane k, the bulge and what samples may be astray included.
     pub fn hull(&self, first: [usize; 2], size: [usize; 2], k: usize) -> Hull {
         let [nx, ny, _] = self.counts;
         let [columns, rows] =
@@ -279,7 +347,8 @@ impl View {
             }
         }
         let (low, high) = (low.to_array(), high.to_array());
-        Hull { low: std::array::from_fn(|c| low[c] - self.bulge[c]), high: std::array::from_fn(|c| high[c] + self.bulge[c]) }
+        let beyond: [f32; 3] = std::array::from_fn(|c| self.bulge[c] + self.astray[c]);
+        Hull { low: std::array::from_fn(|c| low[c] - beyond[c]), high: std::array::from_fn(|c| high[c] + beyond[c]) }
     }
 
     /// Unit directions of the columns, in the grid's axes.

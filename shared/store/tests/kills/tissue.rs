@@ -17,7 +17,14 @@ pub const SIZES: StoreSizes = sizes(2 * BRICKS + 2 * DIRTY as usize, 2 * BRICKS 
 
 /// Every channel that a deforming tissue has.
 pub const fn sizes(spare_slots: usize, displacement_slots: usize) -> StoreSizes {
-    StoreSizes { spare_slots, displacement_slots, plastic_slots: displacement_slots, cut_slots: displacement_slots, label_slots: 0 }
+    StoreSizes {
+        spare_slots,
+        displacement_slots,
+        plastic_slots: displacement_slots,
+        cut_slots: displacement_slots,
+        label_slots: 0,
+        octree_slots: 0,
+    }
 }
 
 /// The volume at rest.
