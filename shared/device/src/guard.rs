@@ -118,7 +118,7 @@ mod tests {
                 last = next;
             }
             assert_eq!((last.force_n, last.torque_n_mm), ([3.0, 0.0, 0.0], [1.0; 3]), "{silent_ms}");
-            assert_eq!((guard.share(), lowest < 3.0), (1.0, silent_ms > 20), "{silent_ms}");
+            assert_eq!((guard.share(), lowest < 3.0), (1.0, silent_ms > 21), "{silent_ms}");
             assert_eq!(lowest == 0.0, silent_ms > 50, "{silent_ms}: {lowest}");
         }
     }
