@@ -27,22 +27,24 @@ pub(crate) struct Breather<'a> {
     report: WarpReport,
     /// what a picture's own lattice may add [mm]: half of the warp's tolerance
     view_mm: f32,
+    /// whether sections or rays ask the field itself
+    keep_field: bool,
     /// lattices that were tried, coarsest first: distance of nodes, and how far from its place anything was drawn by it alone [mm]
     tried: Vec<(f32, f32)>,
 }
 
 impl<'a> Breather<'a> {
     /// Finds a lattice for pictures within the tolerance [mm].
-    pub fn new(patient: Patient<'a>, info: &VolumeInfo, tolerance_mm: f64) -> Self {
+    pub fn new(patient: Patient<'a>, info: &VolumeInfo, tolerance_mm: f64, keep_field: bool) -> Self {
         let extent = |c: usize| info.grid.size[c] as f64 * info.grid.spacing[c];
         let nodes = |pitch: f32| (0..3).map(|c| extent(c) / f64::from(pitch) + 4.0).product::<f64>();
         // a picture's own lattice takes half of what it is given: a third of the whole, as the patient's share is the dearer
         let within_mm = 0.66 * tolerance_mm as f32;
-        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm, ..WarpOptions::default() };
+        let options = |pitch_mm| WarpOptions { tolerance_mm: within_mm, pitch_mm, keep_field, ..WarpOptions::default() };
         let collapsed = Collapsed::new(patient.model(), tolerance_mm as f32);
         let warp = Warp::new(info, options(PITCHES_MM[0]));
         let (report, view_mm) = (WarpReport::default(), 0.5 * within_mm);
-        let mut breather = Self { patient, info: info.clone(), collapsed, warp, report, view_mm, tried: Vec::new() };
+        let mut breather = Self { patient, info: info.clone(), collapsed, warp, report, view_mm, keep_field, tried: Vec::new() };
         // between nodes closer than the fields' own there is nothing to be found but their kinks
         let finest = breather.patient.model().grid().min_spacing() as f32;
         let tried = |&pitch: &f32| nodes(pitch) <= MOST_NODES && (pitch >= finest || pitch >= PITCHES_MM[0]);
@@ -66,7 +68,8 @@ impl<'a> Breather<'a> {
         self.view_mm = 0.5 * within_mm;
         let fits = |(_, off_mm): &&(f32, f32)| f64::from(off_mm + self.view_mm) <= tolerance_mm;
         let pitch_mm = self.tried.iter().find(fits).map_or(LEADING_MM, |(pitch_mm, _)| *pitch_mm);
-        self.warp = Warp::new(&self.info, WarpOptions { tolerance_mm: within_mm, pitch_mm, ..WarpOptions::default() });
+        self.warp =
+            Warp::new(&self.info, WarpOptions { tolerance_mm: within_mm, pitch_mm, keep_field: self.keep_field, ..WarpOptions::default() });
         self.collapsed = Collapsed::new(self.patient.model(), tolerance_mm as f32);
     }
 
@@ -163,7 +166,7 @@ mod tests {
         let scene = Scene::parse("test", SCENE).unwrap();
         let reader = Reader::open(&domain, Role::Rendering).unwrap();
         let mut regions = Regions::open(&domain, &scene).unwrap().unwrap();
-        let mut breather = Breather::new(regions.patient().unwrap(), reader.info(), 0.1);
+        let mut breather = Breather::new(regions.patient().unwrap(), reader.info(), 0.1, false);
         // as the page leads it: fully in, from some time on
         let page = Signal::open(&domain, &scene).unwrap().unwrap();
         let stamp = Stamp { time_ns: 1_000_000_000, sequence: 1, incarnation: 1 };

@@ -7,11 +7,11 @@ use maille_contract::{
 };
 use maille_raycast::{
     Camera, Capsule, Extras, Geometry, Labels, Overlay, Picture, Plane, Quality, RenderError, Section, Settings, Skip, Step, Ultrasound,
-    Warp, ultrasound,
+    Warp, WarpScheme as Rays, render_extra, resampled, ultrasound,
 };
-use maille_scene::{Scene, registry};
+use maille_scene::{Scene, WarpScheme, registry};
 use maille_transport::{Stopwatch, monotonic_ns};
-use maille_volume::BrickSource;
+use maille_volume::{BrickSource, BrickedVolume};
 use rayon::prelude::*;
 
 /// Planes of views 1 to 3, in the order of [`VIEWS`].
@@ -36,6 +36,9 @@ pub(crate) struct Composer {
     pub quality: Quality,
     /// displacement whose colour over a section is opaque [mm]
     overlay_mm: Option<f64>,
+    /// how a patient who breathes is drawn, and by how many steps in sections
+    scheme: WarpScheme,
+    section_steps: usize,
     /// who draws
     pub backend: Backend,
     /// room for a 3D view of fewer pixels
@@ -66,6 +69,8 @@ impl Composer {
             skip_xray: None,
             pictures,
             overlay_mm: scene.rendering.overlay_mm,
+            scheme: scene.rendering.warp_scheme,
+            section_steps: scene.rendering.section_steps,
             quality: Quality::FULL,
             backend: Backend::default(),
             coarse: Picture::new(0, 0),
@@ -137,8 +142,10 @@ impl Composer {
         let in_3d = Geometry { capsules: &thick, meshes: &meshes };
         let inside_tool = Geometry { capsules: &[], meshes: &meshes };
         // an endoscope does not see itself
+        let scheme = if self.scheme == WarpScheme::FixedPoint { Rays::OneStep } else { Rays::Lattice };
         let extras = Extras {
             warp,
+            scheme,
             labels: self.labels.as_ref(),
             geometry: Some(if at_tip { &inside_tool } else { &in_3d }),
             barrel: view.barrel(at_tip),
@@ -146,7 +153,13 @@ impl Composer {
             ..Extras::default()
         };
         let start = monotonic_ns();
-        if [w, h] == [whole.width, whole.height] {
+        let carried = warp.filter(|_| self.scheme == WarpScheme::Resample).map(|warp| carried(source, warp, &settings));
+        if let Some((baked, skip)) = &carried {
+            self.coarse.resize(w, h);
+            let extras = Extras { warp: None, labels: None, zoom: false, ..extras };
+            render_extra(&extras, baked, skip, &camera, &settings, &mut self.coarse)?;
+            enlarge(&self.coarse, whole);
+        } else if [w, h] == [whole.width, whole.height] {
             self.backend.render(&extras, source, skip, &camera, &settings, whole)?;
         } else {
             self.coarse.resize(w, h);
@@ -164,7 +177,7 @@ impl Composer {
                 labels: self.labels.as_ref(),
                 displacement_mm: self.overlay_mm,
                 geometry: Some(&bodies),
-                ..Overlay::default()
+                steps: self.section_steps,
             };
             self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
@@ -206,6 +219,15 @@ impl Composer {
         }
         header
     }
+}
+
+/// The whole patient as moved, and where nothing of it is to be seen: the reference way, a look a voxel for every frame.
+fn carried(source: &impl BrickSource, warp: &Warp, settings: &maille_raycast::Settings) -> (BrickedVolume, Skip) {
+    let grid = &source.info().grid;
+    let rest = |x| grid.world_from_index(warp.rest_index(grid.index_from_world(x).map(|c| c as f32)).map(f64::from));
+    let baked = resampled(source, 1, warp.room_mm(), rest);
+    let skip = Skip::new(&baked, settings);
+    (baked, skip)
 }
 
 /// A picture with more pixels, linear between those that there are: rows are mixed first, for each row of the answer, then pixels along it.

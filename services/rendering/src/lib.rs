@@ -27,7 +27,7 @@ mod view;
 use maille_contract::needle::{NeedleLog, NeedleState};
 use maille_contract::{FrameHeader, Role, ServiceCell, Switches, ToolState, control::Counter};
 use maille_raycast::FrameBudget;
-use maille_scene::{Accuracy, BoxMm, Machine, Plan, Scene, registry::live_knob};
+use maille_scene::{Accuracy, BoxMm, Machine, Plan, Scene, WarpScheme, registry::live_knob};
 use maille_store::Reader;
 use maille_transport::{Domain, Life, Node, Stopwatch, Untimed, monotonic_ns, timed};
 use std::{
@@ -99,7 +99,8 @@ fn frames<W: Stopwatch + Send>(
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|n| format!("rays-{n}")).build()?;
     let mut view = view::View::new(scene, &BoxMm::of(&reader.info().grid))?;
     let tolerance_mm = scene.breathing.picture_tolerance_mm;
-    let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm)));
+    let asks_field = scene.rendering.warp_scheme == WarpScheme::FixedPoint || scene.rendering.section_steps > 0;
+    let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm, asks_field)));
     composer.backend = backend::Backend::of(scene, reader);
     composer.labels = pool.install(|| organs::labels(scene, &reader.rest()))?;
     composer.meshes = pool.install(|| meshes::Meshes::of(scene, &reader.rest()))?;

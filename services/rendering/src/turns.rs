@@ -26,7 +26,7 @@ impl<'a> Turns<'a> {
     /// As the process itself.
     pub fn open(domain: &Domain, scene: &Scene, reader: &'a Reader, patient: Option<Patient<'a>>) -> Result<Self, RenderingError> {
         let view = View::new(scene, &BoxMm::of(&reader.info().grid))?;
-        let breather = patient.map(|patient| Breather::new(patient, reader.info(), scene.breathing.picture_tolerance_mm));
+        let breather = patient.map(|patient| Breather::new(patient, reader.info(), scene.breathing.picture_tolerance_mm, false));
         let mut composer = Composer::new(scene);
         composer.labels = organs::labels(scene, &reader.rest())?;
         composer.meshes = meshes::Meshes::of(scene, &reader.rest())?;

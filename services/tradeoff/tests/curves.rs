@@ -33,7 +33,7 @@ fn names_choose_curves_by_name_by_engine_and_by_beginning() {
         chosen(&only.iter().map(|s| (*s).to_string()).collect::<Vec<_>>()).unwrap().iter().map(|c| c.name).collect()
     };
     assert_eq!(names(&["rendering.step"]), ["rendering.step"]);
-    assert_eq!(names(&["rendering"]), ["rendering.step", "rendering.opacity_end", "rendering.scale"]);
+    assert_eq!(names(&["rendering"]), ["rendering.step", "rendering.opacity_end", "rendering.scale", "rendering.warp_scheme"]);
     assert!(names(&["chainmail"]).contains(&"deformation.offset"));
     assert_eq!(names(&[]).len(), curves().count());
     assert!(chosen(&["nothing".into()]).is_err_and(|e| e.to_string().contains("rendering.step")));

@@ -9,7 +9,7 @@ use crate::{
     voxels::{Placement, Traffic, Voxels},
     warp::Lattice,
 };
-use maille_raycast::{Camera, Extras, Kernel, Light, Mode, Picture, Settings, Skip, twin};
+use maille_raycast::{Camera, Extras, Kernel, Light, Mode, Picture, Settings, Skip, WarpScheme, twin};
 use maille_store::Reader;
 use maille_volume::{BrickLayout, BrickSource};
 use std::{collections::HashMap, sync::Arc};
@@ -158,6 +158,9 @@ impl Renderer {
     ) -> Result<(wgpu::SubmissionIndex, FrameReport), GpuError> {
         if extras.zoom && matches!(settings.mode, Mode::Isosurface { .. }) && extras.warp.is_none() {
             return Err(GpuError::Unsupported("the smooth function in near views of a surface is the CPU's".into()));
+        }
+        if extras.warp.is_some() && extras.scheme != WarpScheme::Lattice {
+            return Err(GpuError::Unsupported("rays by one step of the fixed point a sample are the CPU's".into()));
         }
         // the scalar kernel refuses what the device can draw
         let extras = &Extras { kernel: Kernel::Fastest, ..*extras };

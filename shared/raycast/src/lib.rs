@@ -50,7 +50,7 @@ pub use geometry::{Capsule, Geometry, MeshView, carry, vertex_normals};
 pub use labels::Labels;
 pub use overlay::{Shown, overlay_section, overlay_view};
 pub use picture::Picture;
-pub use render::{Extras, Kernel, RenderError, render, render_extra, render_with};
+pub use render::{Extras, Kernel, RenderError, WarpScheme, render, render_extra, render_with};
 pub use section::{Overlay, Plane, Section, SlabMode, section, section_with};
 pub use settings::{Adaptive, Light, Mode, Settings, Shading, Step};
 pub use skip::{Skip, SkipUpdate};

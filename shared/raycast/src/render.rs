@@ -71,6 +71,17 @@ pub enum Kernel {
     ScalarWithoutSkipping,
 }
 
+/// How rays go through a warp.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum WarpScheme {
+    /// by lattices, and one by one where those do not suffice: within the warp's tolerance
+    #[default]
+    Lattice,
+    /// one step of the fixed point a sample [Fortmeier et al. 2015, eq. 1 and 2]: a reference, whose error nobody knows. The warp must keep its field
+    /// ([`WarpOptions::keep_field`](crate::WarpOptions))
+    OneStep,
+}
+
 /// What a picture may have beside volume, camera and settings.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Extras<'a> {
@@ -78,6 +89,8 @@ pub struct Extras<'a> {
     pub kernel: Kernel,
     /// a displacement field that rays go through
     pub warp: Option<&'a Warp>,
+    /// how they go through it
+    pub scheme: WarpScheme,
     /// colours of organs (volume modes)
     pub labels: Option<&'a Labels>,
     /// solid bodies among the voxels
@@ -95,6 +108,8 @@ pub(crate) struct Stage<'a, S: ?Sized> {
     pub source: &'a S,
     pub skip: &'a Skip,
     pub labels: Option<&'a Labels>,
+    /// what rays go through by one step a sample
+    pub led: Option<&'a Warp>,
 }
 
 /// Where rays of a band end.
@@ -152,8 +167,9 @@ pub fn render_extra<S: BrickSource + ?Sized>(
     let margin = extras.warp.map_or([0.0; 3], Warp::margin);
     let frame = Frame::new(source.info(), camera, settings, [width, height], extras.barrel as f32, margin);
     let caster = Caster { frame: &frame, source, skip, jumps: extras.kernel != Kernel::ScalarWithoutSkipping };
-    let stage = Stage { frame: &frame, source, skip, labels: extras.labels };
-    let view = extras.warp.map(|w| View::new(w, &frame, Some(skip), [width, height], TILES));
+    let led = extras.warp.filter(|_| extras.scheme == WarpScheme::OneStep);
+    let stage = Stage { frame: &frame, source, skip, labels: extras.labels, led };
+    let view = extras.warp.filter(|_| led.is_none()).map(|w| View::new(w, &frame, Some(skip), [width, height], TILES));
     let solids = extras.geometry.filter(|g| !g.is_empty());
     let solids = solids.map(|g| Solids::new(g, camera, settings, [width, height], extras.barrel as f32, BAND));
     let lanes = match extras.kernel {
@@ -199,6 +215,7 @@ pub fn render_extra<S: BrickSource + ?Sized>(
                     let clear = match &view {
                         // so that rays which come in where the volume is cut open have a sample outside before
                         Some(view) => view.span(n * width.div_ceil(TILE) + x0 / TILE)[0] - frame.step,
+                        None if led.is_some() => 0.0,
                         None => beam::span(&frame, skip, None, first, size, 0.0)[0],
                     };
                     if clear == f32::INFINITY && solid.is_none() {
@@ -251,6 +268,9 @@ pub(crate) fn check_extras<S: BrickSource + ?Sized>(extras: &Extras<'_>, source:
     }
     if extras.warp.is_some_and(|w| !w.suits(source.info())) {
         return fault("the warp was made for another volume, or never updated");
+    }
+    if extras.scheme == WarpScheme::OneStep && extras.warp.is_some_and(|w| w.whole().is_none()) {
+        return fault("rays by one step of the fixed point ask the field itself: the warp must keep it");
     }
     if extras.labels.is_some_and(|l| l.size() != source.info().grid.size) {
         return fault("the labels are not on the volume's grid");

@@ -17,7 +17,7 @@ use crate::{
     scalar::{Seen, ZERO_GRADIENT},
     settings::Mode,
     skip::GENTLE,
-    warp::{Bend, Tile},
+    warp::{Bend, Led, Tile},
 };
 use maille_volume::{
     BrickSource,
@@ -202,6 +202,8 @@ struct Walker<'a, 't, 'v, L: Lanes, S: BrickSource + ?Sized> {
     /// steps for one index step, where rays are straight
     inverse: [L::Float; 3],
     bend: Option<Bend<'t, 'v, L>>,
+    /// instead of it, step by step
+    led: Option<Led<'a, L>>,
     /// whether rays may end within the volume, at a body
     ends: bool,
     /// number of the brick in which each lane is
@@ -302,7 +304,13 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
                 let p = axes!(c => place.base[c].float() + place.fraction[c]);
                 bend.turn(self.l, self.frame, &p, &g, lanes)
             }
-            None => g,
+            None => match &self.led {
+                Some(led) => {
+                    let p = axes!(c => place.base[c].float() + place.fraction[c]);
+                    led.turn(self.l, &p, &g, self.frame.per_mm)
+                }
+                None => g,
+            },
         }
     }
 
@@ -347,7 +355,13 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
     fn bent(&mut self, q: L::Float, alive: L::Mask) -> [L::Float; 3] {
         match &mut self.bend {
             Some(bend) => bend.bend(self.l, q, alive),
-            None => self.rays.at(q),
+            None => {
+                let x = self.rays.at(q);
+                match &mut self.led {
+                    Some(led) => led.lead(self.l, &x, q, &self.rays.delta, alive),
+                    None => x,
+                }
+            }
         }
     }
 
@@ -385,6 +399,8 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
     fn way_out(&self, d: L::Int, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
         match &self.bend {
             Some(bend) => bend.way_out(self.l, d.float(), corner, p),
+            // a lead is as good as the sample before
+            None if self.led.is_some() => self.l.set(0.0),
             None => self.box_exit(&self.inverse, d.float(), corner, p),
         }
     }
@@ -476,6 +492,13 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
                     edge = outside;
                     empty = empty | outside;
                     Some((outside, jump))
+                }
+                None if self.led.is_some() => {
+                    let outside = beyond(l, frame, &p);
+                    fresh = edge & !outside;
+                    edge = outside;
+                    empty = empty | outside;
+                    Some((outside, zero))
                 }
                 None => None,
             };
@@ -642,11 +665,19 @@ fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::
     }
     let mut outside = l.set(0.0).lt(gap);
     if bend.is_exact() {
-        for (c, &p) in p.iter().enumerate() {
-            outside = outside | p.lt(l.set(0.0)) | l.set(frame.last[c]).lt(p);
-        }
+        outside = outside | beyond(l, frame, p);
     }
     (outside, gap)
+}
+
+/// Which lanes are out of the volume.
+#[inline(always)]
+fn beyond<L: Lanes>(l: L, frame: &Frame, p: &[L::Float; 3]) -> L::Mask {
+    let mut outside = l.set(1.0).lt(l.set(0.0));
+    for (c, &p) in p.iter().enumerate() {
+        outside = outside | p.lt(l.set(0.0)) | l.set(frame.last[c]).lt(p);
+    }
+    outside
 }
 
 impl Packet {
@@ -685,7 +716,11 @@ pub fn cast<L: Lanes, S: BrickSource + ?Sized>(
     let first = stage.source.brick(0).voxels.as_ptr();
     let rays = Rays::new(l, frame, ends, x, y);
     let bend = tile.map(|tile| Bend::new(l, frame, tile, [x, y], rays.start, [rays.origin, rays.delta]));
+    let led = match stage.led {
+        Some(warp) => Led::new(l, warp, rays.origin),
+        None => None,
+    };
     let inverse = axes!(c => l.set(1.0) / rays.delta[c]);
-    let mut walker = Walker { l, stage, frame, rays, inverse, bend, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] };
+    let mut walker = Walker { l, stage, frame, rays, inverse, bend, led, ends: ends.is_some(), ids: l.int(0), voxels: [first; MOST] };
     walker.walk(clear)
 }

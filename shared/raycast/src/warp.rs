@@ -14,12 +14,13 @@
 //! the unwarped volume holds, nothing of it is made anew, and rays jump nearly as far as straight ones (`Bend::way_out`).
 //!
 //! Frames: positions and displacements inside are continuous indices of the volume; millimetres at the border.
-//! References, to be compared with: the paper's own scheme ([`Moment::along`]), and the volume [`resampled`]. Not here: where fields come from.
+//! References, to be compared with: the paper's own scheme ([`Moment::along`]; drawn: [`crate::WarpScheme`]), and the volume [`resampled`]. Not here: where fields come from.
 
 mod bend;
 mod exact;
 mod field;
 mod lattice;
+mod led;
 mod reference;
 mod rough;
 mod settle;
@@ -31,6 +32,7 @@ pub use exact::Exact;
 pub(crate) use exact::{FOLDED, LOOKS, SHORTEST};
 pub use field::{Moment, Motion, WarpError};
 pub use lattice::{Warp, WarpOptions, WarpReport};
+pub(crate) use led::Led;
 pub use reference::resampled;
 pub(crate) use tile::Tile;
 pub(crate) use view::{Hull, View};

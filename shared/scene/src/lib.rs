@@ -46,7 +46,7 @@ pub use registry::{Channel, Effect, Knob, Process};
 pub use resolve::View;
 pub use scene::{Accuracy, EffectSetting, PhantomKind, Scene, Size, VolumeSection, VolumeSource};
 pub use sections::{
-    Backend, CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering, TouchedSurface,
+    Backend, CameraKind, Console, Deformation, Haptic, Memory, Metric, Mode, Pins, Push, Relaxation, Rendering, TouchedSurface, WarpScheme,
 };
 pub use tissue::Tissue;
 pub use tool::{Approach, Device, DeviceSection, PROFILES, PathPoint, RealDevice, Shape, Tool, ToolKind};

@@ -3,7 +3,10 @@
 //! A part that adds an effect or a knob adds an entry here and nothing else; the plan derives from these tables alone
 //! ([`crate::plan`]), so that what no entry asks for is not there at run time. Whatever stands here can be run.
 
-use crate::{scene::Scene, sections::Metric};
+use crate::{
+    scene::Scene,
+    sections::{Metric, WarpScheme},
+};
 use maille_volume::brick::{Brick, EDGE};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
@@ -537,6 +540,24 @@ pub static KNOBS: &[Knob] = &[
             Metric::Round => 1.0,
         },
         set: |s, v| s.deformation.metric = if v == 0.0 { Metric::Cubic } else { Metric::Round },
+    },
+    Knob {
+        name: "rendering.warp_scheme",
+        effect: "breathing",
+        stage: Some((Process::Rendering, "ray casting")),
+        summary: "how a patient who breathes is drawn: 0 by a lattice of the inverse, 1 by one step of the fixed point a sample, 2 resampled whole",
+        defaults: [0.0, 0.0, 0.0],
+        error: "difference of the picture [part of full scale]",
+        truth: "the picture of the volume resampled finely by the inverse by formula",
+        cost: "frame time: a look at the field a sample and no jumps (1), a look a voxel (2)",
+        get: |s| f64::from(s.rendering.warp_scheme as u32),
+        set: |s, v| {
+            s.rendering.warp_scheme = match v {
+                1.0 => WarpScheme::FixedPoint,
+                2.0 => WarpScheme::Resample,
+                _ => WarpScheme::Lattice,
+            }
+        },
     },
     Knob {
         name: "haptic.contact_stiffness_n_per_mm",

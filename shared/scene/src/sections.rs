@@ -177,6 +177,19 @@ impl Default for Haptic {
     }
 }
 
+/// How a patient who breathes is drawn.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum WarpScheme {
+    /// rays through a lattice of the inverse, and one by one where that does not suffice: within `breathing.picture_tolerance_mm`
+    #[default]
+    Lattice,
+    /// one step of the fixed point a sample (the paper's); a reference, whose error nobody knows
+    FixedPoint,
+    /// the whole volume resampled for every frame, then drawn; a reference, without colours of organs
+    Resample,
+}
+
 /// What the 3D view shows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -268,6 +281,10 @@ pub struct Rendering {
     /// in a patient who breathes, colour sections by displacement: hue by its direction in the plane, this length [mm] is opaque; by default not
     #[serde(skip_serializing_if = "Option::is_none")]
     pub overlay_mm: Option<f64>,
+    /// how a patient who breathes is drawn in the 3D view: `lattice`, `fixed-point` or `resample` (a knob)
+    pub warp_scheme: WarpScheme,
+    /// steps of the fixed point by which sections of a patient who breathes go on from the lattice's answer, 0 to 50; 0: as rays do
+    pub section_steps: usize,
     /// threads of the process; by default a share of the machine's cores
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<usize>,
@@ -301,6 +318,8 @@ impl Default for Rendering {
             opacity_end: 0.99,
             section_window_hu: [50.0, 800.0],
             overlay_mm: None,
+            warp_scheme: WarpScheme::Lattice,
+            section_steps: 0,
             threads: None,
         }
     }

@@ -11,7 +11,9 @@ use crate::{
     curve::{Context, Curve, KnobOf, Setting, Subject, Theory},
 };
 use maille_phantom::Kind;
-use maille_raycast::{Camera, Extras, Motion, Picture, Preset, Settings, Skip, Warp, WarpOptions, WarpReport, render_extra};
+use maille_raycast::{
+    Camera, Extras, Motion, Picture, Preset, Settings, Skip, Warp, WarpOptions, WarpReport, WarpScheme, render, render_extra, resampled,
+};
 use maille_testkit::{Displacement as _, SinusoidalShear, sample_displacement};
 use maille_volume::{BrickSource, Grid};
 use std::sync::Arc;
@@ -55,6 +57,21 @@ pub(super) static CURVES: &[Curve] = &[
             bench(c, Pitch::Sought, &[0.3, 0.2, 0.1, 0.06, 0.03].map(|t: f32| (t, one(t))))
         },
     },
+    Curve {
+        name: "rendering.warp_scheme",
+        engine: "raycast",
+        knob: KnobOf::Registry("rendering.warp_scheme"),
+        title: "how a patient who breathes is drawn: by a lattice of the inverse, by one step of the fixed point a sample, resampled whole",
+        error: "difference of the picture, root of the mean square over all channels (largest: of any)",
+        unit: "% of full scale",
+        truth: "the picture of the volume resampled twice as finely by the inverse by formula of a wave of shear",
+        timed: "the frame's inverse, the volume resampled where it is, and the frame",
+        theory: Theory::Not(
+            "schemes are no line from coarse to fine; the truth is interpolated once more than the patient, so that none comes to nothing, and the volume resampled on \
+             its own grid is smoother than what it is of",
+        ),
+        bench: schemes,
+    },
 ];
 
 /// Pitches tried for a tolerance [mm], coarse to fine.
@@ -74,16 +91,72 @@ fn drawn_off_mm(report: &WarpReport, view_mm: f32) -> f32 {
     report.lattice_mm + view_mm
 }
 
+const SHEAR: SinusoidalShear =
+    SinusoidalShear { normal: [1.0, 0.0, 0.0], along: [0.0, 0.6, 0.8], amplitude: 10.0, wavelength: 200.0, phase: 0.4 };
+
+/// The wave on nodes over a volume.
+fn wave(grid: &Grid) -> Result<Motion, TradeoffError> {
+    let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64);
+    let mut nodes = Grid::axis_aligned([96; 3], extent.map(|e| e / 95.0));
+    (nodes.origin, nodes.direction) = (grid.origin, grid.direction);
+    Motion::new(&[sample_displacement(&nodes, &SHEAR)]).map_err(|e| TradeoffError::Bench("raycast", e.to_string()))
+}
+
+/// One picture by each scheme.
+fn schemes(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
+    let fail = |e: &dyn std::fmt::Display| TradeoffError::Bench("raycast", e.to_string());
+    let patient = context.patients.made(Kind::Head, context.effort);
+    let volume = Arc::clone(&patient.volume);
+    let grid = volume.info().grid.clone();
+    let motion = Arc::new(wave(&grid)?);
+    // what light makes of differences over a voxel, or half of one, is another matter
+    let settings = Arc::new(Settings { opacity_end: 0.99, shading: None, ..Settings::volume(Preset::Skin.transfer()) });
+    let camera = Camera::around(volume.info());
+    let [width, height] = context.effort.pick([160, 128], [612, 507]);
+    let mut truth = Picture::new(width, height);
+    let fine = resampled(&*volume, 2, 12.0, |x| {
+        let v = SHEAR.inverse(x);
+        std::array::from_fn(|c| x[c] + v[c])
+    });
+    render(&fine, &Skip::new(&fine, &settings), &camera, &settings, &mut truth).map_err(|e| fail(&e))?;
+    let mut out = Vec::new();
+    for (value, called) in [(2.0, "resampled whole"), (1.0, "one step a sample"), (0.0, "lattice")] {
+        let mut warp = Warp::new(volume.info(), WarpOptions { keep_field: value == 1.0, ..WarpOptions::default() });
+        let skip = Skip::new(&*volume, &settings);
+        let (volume, motion, settings, grid) = (Arc::clone(&volume), Arc::clone(&motion), Arc::clone(&settings), grid.clone());
+        let mut draw = move |amount: f32, picture: &mut Picture| {
+            warp.update(volume.info(), &motion, &[amount]).map_err(|e| e.to_string())?;
+            let drawn = if value == 2.0 {
+                let rest = |x| grid.world_from_index(warp.rest_index(grid.index_from_world(x).map(|c| c as f32)).map(f64::from));
+                let baked = resampled(&*volume, 1, warp.room_mm(), rest);
+                render(&baked, &Skip::new(&baked, &settings), &camera, &settings, picture)
+            } else {
+                let scheme = if value == 1.0 { WarpScheme::OneStep } else { WarpScheme::Lattice };
+                let extras = Extras { warp: Some(&warp), scheme, ..Extras::default() };
+                render_extra(&extras, &*volume, &skip, &camera, &settings, picture)
+            };
+            drawn.map_err(|e| e.to_string())
+        };
+        let mut picture = Picture::new(width, height);
+        draw(1.0, &mut picture).map_err(|e| fail(&e))?;
+        let errors = super::raycast::difference(&picture, &truth);
+        let mut moment = 0.0f32;
+        let run = move || {
+            moment += 0.03;
+            let amount = 0.85 + 0.15 * moment.sin();
+            spent(|| draw(amount, &mut picture).is_ok())
+        };
+        out.push(Setting::new("", value, errors, run).called(called));
+    }
+    Ok(vec![Subject { name: patient.name, settings: out }])
+}
+
 fn bench(context: &Context, pitch: Pitch, options: &[(f32, WarpOptions)]) -> Result<Vec<Subject>, TradeoffError> {
     let fail = |e: &dyn std::fmt::Display| TradeoffError::Bench("raycast", e.to_string());
     let patient = context.patients.made(Kind::Head, context.effort);
     let volume = Arc::clone(&patient.volume);
     let grid = volume.info().grid.clone();
-    let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64);
-    let mut nodes = Grid::axis_aligned([96; 3], extent.map(|e| e / 95.0));
-    (nodes.origin, nodes.direction) = (grid.origin, grid.direction);
-    let shear = SinusoidalShear { normal: [1.0, 0.0, 0.0], along: [0.0, 0.6, 0.8], amplitude: 10.0, wavelength: 200.0, phase: 0.4 };
-    let motion = Arc::new(Motion::new(&[sample_displacement(&nodes, &shear)]).map_err(|e| fail(&e))?);
+    let motion = Arc::new(wave(&grid)?);
     let settings = Arc::new(Settings { opacity_end: 0.99, ..Settings::volume(Preset::Skin.transfer()) });
     let skip = Arc::new(Skip::new(&*volume, &settings));
     let camera = Camera::around(volume.info());
@@ -107,7 +180,7 @@ fn bench(context: &Context, pitch: Pitch, options: &[(f32, WarpOptions)]) -> Res
         let errors = mean_and_worst(places.map(|share| {
             let index: [f64; 3] = std::array::from_fn(|c| share[c] * (grid.size[c] - 1) as f64);
             let world = grid.world_from_index(index);
-            let v = shear.inverse(world);
+            let v = SHEAR.inverse(world);
             let found = grid.world_from_index(warp.rest_index(index.map(|i| i as f32)).map(f64::from));
             distance(found, std::array::from_fn(|c| world[c] + v[c]))
         }));

@@ -134,6 +134,15 @@ impl<'a> Exact<'a> {
         (u, slopes)
     }
 
+    /// Where one step of the fixed point takes x from a lead [index]: x − u(lead).
+    #[inline(always)]
+    pub(crate) fn step<L: Lanes>(&self, l: L, x: &[L::Float; 3], lead: &[L::Float; 3]) -> [L::Float; 3] {
+        let at = self.field_index(l, lead);
+        let (u, _) = self.jet(l, &at);
+        let m = &self.to_volume;
+        axes!(c => x[c] - u[0].fma(l.set(m[0][c]), u[1].fma(l.set(m[1][c]), u[2] * l.set(m[2][c]))))
+    }
+
     /// Residuals of X for x [field index], and their squared lengths [mm²].
     #[inline(always)]
     fn off<L: Lanes>(&self, l: L, x: &[L::Float; 3], at: &[L::Float; 3], u: &[L::Float; 3]) -> ([L::Float; 3], L::Float) {

@@ -135,6 +135,11 @@ impl Warp {
         &self.nodes
     }
 
+    /// How far matter may leave the volume [mm].
+    pub fn room_mm(&self) -> f64 {
+        (0..3).map(|c| f64::from(self.margin[c] * self.spacing[c])).fold(0.0, f64::max)
+    }
+
     /// The error that was allowed [mm].
     pub(super) fn tolerance_mm(&self) -> f32 {
         self.options.tolerance_mm
@@ -297,7 +302,12 @@ impl Warp {
 
     /// What rays ask in rough cells; none where there are none.
     pub(crate) fn exact(&self) -> Option<Exact<'_>> {
-        let kept = self.kept.as_ref().filter(|_| self.rough.count > 0)?;
+        self.whole().filter(|_| self.rough.count > 0)
+    }
+
+    /// The field for rays that ask nothing but it; none where it is not kept.
+    pub(crate) fn whole(&self) -> Option<Exact<'_>> {
+        let kept = self.kept.as_ref()?;
         let field = (self.collapsed.as_slice(), kept.scale, kept.grid.size);
         let cells = (self.rough.cells.as_slice(), self.counts);
         Some(Exact::new(field, &kept.frames, cells, [self.origin, self.per_pitch], self.stop_mm()))
