@@ -15,8 +15,8 @@ use maille_contact::shaper::{LEAVE_FADE_S, LEAVE_SLEW_N_PER_S};
 use maille_contact::{Coupling, DevicePose, DeviceProfile, Faults, ForceShaper, Limits, TickOutputs};
 use maille_contract::ControlBlock;
 use maille_contract::needle::{
-    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag,
-    NeedleEvent, NeedleLog, NeedleState,
+    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag, NeedleEvent,
+    NeedleLog, NeedleState,
 };
 use maille_needle::{
     AIR, Breathing, Capsule, EventKind, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q,
@@ -329,22 +329,19 @@ impl NeedleStage {
             log.path_nodes = fill(&mut log.path_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
         }
         for event in out.events.iter().flatten() {
-            if let Some(slot) = log.events.get_mut(log.count as usize).filter(|_| (log.count as usize) < NEEDLE_EVENTS) {
-                *slot = NeedleEvent {
-                    time_ns: moment.now_ns,
-                    kind: match event.kind {
-                        EventKind::Contact => NEEDLE_MET,
-                        EventKind::Puncture => NEEDLE_PUNCTURED,
-                        EventKind::Withdrawn => NEEDLE_WITHDRAWN,
-                    },
-                    tissue: event.material.into(),
-                    reference_mm: event.reference_mm,
-                    depth_mm: event.depth_mm,
-                    force_n: event.force_n,
-                    phase: moment.phase,
-                };
-            }
-            log.count += 1;
+            log.take(NeedleEvent {
+                time_ns: moment.now_ns,
+                kind: match event.kind {
+                    EventKind::Contact => NEEDLE_MET,
+                    EventKind::Puncture => NEEDLE_PUNCTURED,
+                    EventKind::Withdrawn => NEEDLE_WITHDRAWN,
+                },
+                tissue: event.material.into(),
+                reference_mm: event.reference_mm,
+                depth_mm: event.depth_mm,
+                force_n: event.force_n,
+                phase: moment.phase,
+            });
         }
     }
 

@@ -96,7 +96,10 @@ impl NeedleReport {
                 breath_phase: (e.phase >= 0.0).then_some(e.phase),
             })
             .collect();
-        let mut forbidden: Vec<String> = events.iter().filter(|e| e.forbidden).map(|e| e.tissue.clone()).collect();
+        // of all events, also of those that are not kept
+        let touched = |n: &usize| log.touched >> (n + 1) & 1 == 1;
+        let mut forbidden: Vec<String> =
+            rows.iter().enumerate().filter(|(n, row)| row.forbidden && touched(n)).map(|(_, row)| row.name.clone()).collect();
         forbidden.sort_unstable();
         forbidden.dedup();
         let [jumps, path_full, buried, invalid_breathing, invalid_poses] = log.faults;

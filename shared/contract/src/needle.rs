@@ -110,8 +110,10 @@ impl NeedleDrag {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct NeedleLog {
-    /// events so far; the first [`NEEDLE_EVENTS`] are kept
+    /// events so far; the first of [`NEEDLE_EVENTS`] are kept, and in the last place the newest
     pub count: u64,
+    /// tissues touched, a bit each: also those of events that are not kept
+    pub touched: u64,
     /// ticks inside the patient
     pub ticks_inside: u64,
     /// time inside the patient [ns]
@@ -139,6 +141,15 @@ pub struct NeedleLog {
     pub events: [NeedleEvent; NEEDLE_EVENTS],
 }
 
+impl NeedleLog {
+    /// Takes an event. Where there is no room for all, the newest takes the last place: how things stand is never lost, nor what was touched.
+    pub fn take(&mut self, event: NeedleEvent) {
+        self.events[(self.count as usize).min(NEEDLE_EVENTS - 1)] = event;
+        self.count += 1;
+        self.touched |= 1u64.checked_shl(event.tissue.min(63) as u32).unwrap_or(0);
+    }
+}
+
 impl NeedleState {
     /// The state, if its numbers can be used.
     pub fn checked(self) -> Option<Self> {
@@ -146,5 +157,24 @@ impl NeedleState {
         let counts = nodes <= NEEDLE_NODES && path <= NEEDLE_NODES && self.radius_mm > 0.0 && self.radius_mm.is_finite();
         let finite = |points: &[[f32; 3]]| points.iter().flatten().all(|v| v.is_finite());
         (counts && finite(&self.nodes_mm[..nodes]) && finite(&self.path_mm[..path])).then_some(self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// However often a needle prods: what it touched and how things stand is known at the end.
+    #[test]
+    fn a_full_log_still_says_what_was_touched_and_what_was_last() {
+        let mut log: NeedleLog = Zeroable::zeroed();
+        let event = |n: u64, kind: u64| NeedleEvent { time_ns: n, kind, tissue: if n == 100 { 7 } else { 1 }, ..Zeroable::zeroed() };
+        for n in 0..200 {
+            log.take(event(n, if n % 2 == 0 { NEEDLE_MET } else { NEEDLE_WITHDRAWN }));
+        }
+        log.take(event(200, NEEDLE_PUNCTURED));
+        assert_eq!((log.count, log.touched), (201, 1 << 1 | 1 << 7));
+        assert!(log.events[..NEEDLE_EVENTS - 1].iter().enumerate().all(|(n, e)| e.time_ns == n as u64));
+        assert_eq!(log.events[NEEDLE_EVENTS - 1], event(200, NEEDLE_PUNCTURED));
     }
 }
