@@ -16,7 +16,8 @@ use std::time::Instant;
 ///
 /// The field takes rest to deformed: a vector of three numbers a voxel, LPS millimetres, as ITK, elastix, ANTs and plastimatch write it and
 /// as `maille deform --displacement` does. The output takes deformed to rest on the same grid. Where no rest position lies inside
-/// the grid, or tissue is folded, it is NaN; how many such nodes there are is always said.
+/// the grid it is NaN; how many such nodes there are is always said. Where tissue is folded several rest positions lie behind one node, and one of them
+/// is written: `--folds` shows where, at rest, and how many cells are folded is always said.
 #[derive(clap::Args)]
 pub struct Args {
     /// displacement field: NRRD, MHA or NIfTI with three components

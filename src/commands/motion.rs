@@ -457,7 +457,10 @@ fn read_signals(path: &Path, phases: usize) -> Result<Vec<Vec<f64>>, Failure> {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#')) {
         let number = |v: &str| v.parse::<f64>().ok().filter(|v| v.is_finite());
-        let row: Option<Vec<f64>> = line.split([',', ';', ' ', '\t']).filter(|v| !v.is_empty()).map(number).collect();
+        // beside a semicolon or a tab a comma is decimal; alone, or with blanks, it separates
+        let decimal = line.contains([';', '\t']);
+        let point = if decimal { line.replace(',', ".") } else { line.to_owned() };
+        let row: Option<Vec<f64>> = point.split([',', ';', ' ', '\t']).filter(|v| !v.is_empty()).map(number).collect();
         let row = row.filter(|row| !row.is_empty() && rows.first().is_none_or(|first| first.len() == row.len()));
         rows.push(row.ok_or_else(|| {
             Failure::Refused(format!(
@@ -497,7 +500,8 @@ fn eval(args: &EvalArgs) -> Outcome {
         field.vectors.iter_mut().zip(part.vectors).for_each(|(sum, v)| (0..3).for_each(|d| sum[d] += c * v[d]));
     }
     let longest = field.vectors.iter().map(|v| v.iter().map(|c| c * c).sum::<f32>()).fold(0.0, f32::max).sqrt();
-    if !longest.is_finite() {
+    // the largest of numbers of which some are none may be one
+    if !longest.is_finite() || !field.vectors.iter().flatten().all(|c| c.is_finite()) {
         return Err(Failure::Refused(format!(
             "{name}: displacements at this moment are not finite; give a moment nearer to the model's own"
         )));

@@ -7,7 +7,7 @@ use maille_contract::{
 };
 use maille_motion::model::sampled;
 use maille_motion::resample::grid_of_size;
-use maille_motion::{MotionModel, Precision};
+use maille_motion::{Kind, MotionModel, Precision};
 use maille_scene::{PhantomKind, Scene, VolumeSource};
 use maille_store::{Region, StoreKeeper};
 use maille_transport::Domain;
@@ -53,6 +53,14 @@ pub fn prepare(scene: &Scene, volume: &Grid) -> Result<Option<Prepared>, Breathi
             let bytes = read(file)?;
             let fail = |fault| BreathingError::Model { path: file.clone(), fault };
             let given = MotionModel::view(&bytes).map_err(fail)?;
+            if let &Kind::Surrogate { signals, .. } = given.kind()
+                && signals > 2
+            {
+                // nothing in a run measures the others, and held at any one value they would move the patient by what they are not
+                let advice =
+                    "a run knows the depth of breath and its rate of change: fit it with these two (`maille motion eval` takes them all)";
+                return Err(BreathingError::Scene(format!("{}: a surrogate model of {signals} signals; {advice}", file.display())));
+            }
             lies_on(&given, volume).map_err(|fault| BreathingError::Elsewhere { path: file.clone(), fault })?;
             given.remade(spacing, precision).map_err(fail)?
         }

@@ -53,6 +53,11 @@ pub fn register_phases(
 ) -> Result<Vec<(VectorField, Quality)>, String> {
     let rest = phases.get(reference).ok_or_else(|| format!("reference {} of {} phases", reference + 1, phases.len()))?;
     let masks = options.sliding.then(|| (lung_mask(rest), bone_mask(rest)));
+    if masks.as_ref().is_some_and(|(lung, _)| !lung.contains(&true)) {
+        return Err(
+            "no lung is found in the reference phase, so nothing slides: leave sliding out, or choose a phase that shows the lungs".into(),
+        );
+    }
     let anatomy = masks.as_ref().map_or(Anatomy::default(), |(lung, bone)| Anatomy { slides: Some(lung), stiff: Some(bone) });
     let field = |(n, phase): (usize, &ScalarField)| {
         let u = if n == reference {

@@ -117,7 +117,7 @@ impl Kind {
                 let mut z = [0.0; MAX_TERMS];
                 z[0] = ends[0] + breath.level * range;
                 z[1] = breath.rate * range;
-                // further signals are nobody's here: held at 0, their mean
+                // further signals are nobody's here: at 0, whatever that is for them (a run refuses such a model)
                 self.weights_of(&z[..*signals])
             }
         }

@@ -66,21 +66,43 @@ const REACH: f64 = 3.0;
 /// A recording shorter than this many good samples says nothing of breathing.
 const FEWEST: usize = 16;
 
+/// The most rows whose times rise from each to the next (longest increasing subsequence, by patience sorting), as their numbers.
+fn longest_rise(rows: &[(f64, f64)]) -> Vec<usize> {
+    // the last row of the best run of each length, and each row's forerunner in its run
+    let (mut ends, mut before): (Vec<usize>, Vec<Option<usize>>) = (Vec::new(), Vec::with_capacity(rows.len()));
+    for (n, &(time, _)) in rows.iter().enumerate() {
+        let at = ends.partition_point(|&end| rows[end].0 < time);
+        before.push(at.checked_sub(1).map(|a| ends[a]));
+        if at == ends.len() {
+            ends.push(n);
+        } else {
+            ends[at] = n;
+        }
+    }
+    let mut run: Vec<usize> = std::iter::successors(ends.last().copied(), |&n| before[n]).collect();
+    run.reverse();
+    run
+}
+
 impl Trace {
-    /// A recording from numbers: sorts nothing, drops what is not finite, not later than the row before, or out of reach.
+    /// A recording from numbers: sorts nothing, drops what is not finite, out of reach, or out of the order of times that most rows keep (one time
+    /// stamp that leaps ahead costs its own row, not all that come before it again).
     ///
     /// # Errors
     /// One sentence when too little is left.
     pub fn new(name: &str, rows: impl IntoIterator<Item = (f64, f64)>) -> Result<Self, SignalError> {
         let mut trace = Self { name: name.into(), times_s: vec![], values: vec![], dropped_rows: 0, outlier_rows: 0, irregular_rows: 0 };
+        let mut finite: Vec<(f64, f64)> = Vec::new();
         for (time, value) in rows {
-            if time.is_finite() && value.is_finite() && trace.times_s.last().is_none_or(|&last| time > last) {
-                trace.times_s.push(time);
-                trace.values.push(value);
+            if time.is_finite() && value.is_finite() {
+                finite.push((time, value));
             } else {
                 trace.dropped_rows += 1;
             }
         }
+        let ordered = longest_rise(&finite);
+        trace.dropped_rows += finite.len() - ordered.len();
+        (trace.times_s, trace.values) = ordered.into_iter().map(|n| finite[n]).unzip();
         trace.drop_outliers();
         if trace.times_s.len() < FEWEST {
             let fault =
@@ -173,6 +195,18 @@ mod tests {
         assert_eq!((trace.outlier_rows, trace.dropped_rows), (31, 0));
         assert_eq!(trace.gaps(0.15).len(), 2);
         assert!(trace.values.iter().all(|v| (46.0..=54.0).contains(v)));
+    }
+
+    /// A single time stamp far ahead, at any place, costs one row; a clock that starts again keeps the longer part.
+    #[test]
+    fn one_bad_time_costs_one_row() {
+        for bad in [0, 7, 100, 398] {
+            let rows = (0..400).map(|n| (if n == bad { 99_999.9 } else { f64::from(n) * 0.1 }, wave(f64::from(n) * 0.1)));
+            let trace = Trace::new("leap", rows).unwrap();
+            assert_eq!((trace.times_s.len(), trace.dropped_rows), (399, 1), "{bad}");
+        }
+        let again = (0..400).map(|n| (f64::from(if n < 250 { n } else { n - 250 }) * 0.1, wave(f64::from(n) * 0.1)));
+        assert_eq!(Trace::new("again", again).unwrap().dropped_rows, 150);
     }
 
     #[test]
