@@ -6,9 +6,10 @@
 //! longer the nearer the load is to the bound: what grows is the time beyond it, weighed with the distance. One knob is turned at a time, and
 //! nothing is judged for [`SETTLE_S`] after a turn.
 //!
-//! Hysteresis: down at a load of 1, up only where the load expected there is below [`CALM`]. A rung that was climbed and had to be left again within
+//! Hysteresis: down at a load of 1, up where the load expected there is below [`CALM`]. A rung that was climbed and had to be left again within
 //! [`REGRET_S`] is remembered with the load at which it was tried: while that load goes on, each next climb waits twice as long, up to
-//! [`LONGEST_WAIT_S`]. Once the load is by [`CHANGED`] of it lower, what pressed is gone, and nothing is waited for. Loads at different rungs are
+//! [`LONGEST_WAIT_S`]. What is expected of a rung was measured on another scene, and may be too much: where it alone forbids a climb while the load
+//! itself is calm, one is tried after [`TRIES`] times that wait. Once the load is by [`CHANGED`] of it lower, what pressed is gone, and nothing is waited for. Loads at different rungs are
 //! compared by what they would be with nothing given up.
 //!
 //! There is no knob of the haptic loop here: what a hand feels is not traded for time. Loads [share of the period] and times [s] come in,
@@ -103,6 +104,8 @@ pub const SETTLE_S: f64 = 0.3;
 pub const REGRET_S: f64 = 2.0;
 /// Longest time of calm that is asked for after climbs that were wrong [s]; half of it passes where there is much room.
 pub const LONGEST_WAIT_S: f64 = 40.0;
+/// How many times longer calm is asked for where the load is calm, and only what is expected of the next rung forbids it.
+pub const TRIES: f64 = 10.0;
 /// A load this much lower than that of a climb that was wrong is another one.
 pub const CHANGED: f64 = 0.8;
 
@@ -129,6 +132,8 @@ struct Watch {
     taken: Vec<usize>,
     pressed_s: f64,
     calm_s: f64,
+    /// calm in which only what was expected forbade the next climb [s]
+    doubted_s: f64,
     /// calm asked for before the next climb [s]
     wait_s: f64,
     /// since the last climb [s], until it is known whether it was right, and the load before it
@@ -162,6 +167,7 @@ impl Watch {
             Some(e) if e < CALM => self.calm_s + weight(2.0 * (CALM - e)),
             _ => 0.0,
         };
+        self.doubted_s = if expected.is_some() && load.load < CALM { self.doubted_s + dt_s } else { 0.0 };
         if self.wrong_at.is_some_and(|wrong| self.whole(load, rungs) < CHANGED * wrong) {
             (self.wrong_at, self.wait_s) = (None, CALM_S);
         }
@@ -180,7 +186,8 @@ pub struct Governor {
 impl Governor {
     /// At the top of the ladder: nothing is given up.
     pub fn new(ladder: Ladder) -> Self {
-        let watch = |of| Watch { of, taken: Vec::new(), pressed_s: 0.0, calm_s: 0.0, wait_s: CALM_S, trial: None, wrong_at: None };
+        let watch =
+            |of| Watch { of, taken: Vec::new(), pressed_s: 0.0, calm_s: 0.0, doubted_s: 0.0, wait_s: CALM_S, trial: None, wrong_at: None };
         Self { ladder, watches: [watch(Loop::Deformation), watch(Loop::Rendering)], settling_s: 0.0, turns: 0 }
     }
 
@@ -219,7 +226,7 @@ impl Governor {
         let turn = self.down(loads).or_else(|| self.up(loads))?;
         self.settling_s = SETTLE_S;
         self.turns += 1;
-        self.watches.iter_mut().for_each(|w| (w.pressed_s, w.calm_s) = (0.0, 0.0));
+        self.watches.iter_mut().for_each(|w| (w.pressed_s, w.calm_s, w.doubted_s) = (0.0, 0.0, 0.0));
         Some(turn)
     }
 
@@ -241,7 +248,7 @@ impl Governor {
 
     fn up(&mut self, loads: &[Load]) -> Option<Turn> {
         let rungs = self.ladder.rungs();
-        for watch in self.watches.iter_mut().filter(|w| w.calm_s >= w.wait_s) {
+        for watch in self.watches.iter_mut().filter(|w| w.calm_s >= w.wait_s || w.doubted_s >= TRIES * w.wait_s) {
             let load = seen(loads, watch.of);
             let before = watch.whole(load, rungs);
             let Some(last) = watch.taken.pop() else { continue };

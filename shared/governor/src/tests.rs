@@ -67,7 +67,9 @@ fn a_start_between_two_settings_that_were_measured_has_the_rungs_below_it() {
     // half-way: 0.75 of the time
     assert!((down.finer, down.coarser) == (1.5, 2.0) && (down.saves - 0.5 / 0.75).abs() < 1e-12, "{down:?}");
     assert_eq!(rungs(0.7).iter().map(|r| r.coarser).collect::<Vec<_>>(), [1.0, 2.0]);
-    assert_eq!((rungs(0.4).len(), rungs(3.0).len(), rungs(f64::NAN).len()), (0, 0, 0), "nothing is known there");
+    // finer than was measured: as the finest that was, with what it saves told too low; coarser, or no number: nothing
+    assert_eq!(rungs(0.4).iter().map(|r| (r.finer, r.coarser, r.saves)).collect::<Vec<_>>(), [(0.4, 1.0, 0.5), (1.0, 2.0, 0.5)]);
+    assert_eq!((rungs(3.0).len(), rungs(f64::NAN).len()), (0, 0));
 }
 
 #[test]
@@ -128,6 +130,19 @@ fn a_front_that_is_wrong_on_this_machine_makes_turns_rarer_and_rarer() {
 }
 
 /// Climbs that were wrong make the next wait long, as long as it is the same that presses; once that is gone, what it taught is gone too.
+/// The front promises so much of a rung that nothing ever seems to be had back; the machine takes next to nothing for it.
+#[test]
+fn what_only_a_front_forbids_is_tried_when_the_machine_is_calm() {
+    let mut m = Machine::new();
+    m.run(5.0, 2.5, 0.1);
+    assert!(m.governor.given_up().count() > 1);
+    // load that no knob moves, between what is calm and what would be too much by the front
+    for _ in 0..600 {
+        m.governor.observe(&[Load::new(Loop::Rendering, 0.8)], DT_S);
+    }
+    assert_eq!(m.governor.given_up().count(), 0, "all is tried, and stays");
+}
+
 #[test]
 fn what_was_learnt_of_a_load_does_not_outlive_it() {
     let mut machine = Machine::new();
