@@ -325,7 +325,7 @@ fn a_label_map_beside_a_file_says_what_is_where_and_one_on_another_grid_is_refus
     let of_file = |labels: &str| {
         scene(&[0.0, 0.3, 1.5, 1.6, 3.0, 3.4, 5.0], "path")
             .replace("phantom = \"torso\"\nsize = [128, 96, 128]", &format!("file = {ct:?}\nlabels = {labels:?}"))
-            .replace("breathing = true\n", "")
+            .replace("breathing = true\n", "breathing = false\n")
     };
     let file = scratch.file("run.json");
     let living = Living::start(&scratch, &of_file(named.to_str().unwrap()), &["--report", file.to_str().unwrap()]);

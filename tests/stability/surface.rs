@@ -4,7 +4,9 @@ use crate::{
     Case, Digest, Invariant, Seen, at_most, hard_cases,
     made::{Random, volume},
 };
-use maille_vif::{Incision, LocalSurface, Neighbourhood, Octree, Options, Spline, Tolerance, Tool, Voxels, Window, carve};
+use maille_vif::{
+    BRICK_LEAVES_BYTES, Incision, KeptOctree, LocalSurface, Neighbourhood, Octree, Options, Spline, Tolerance, Tool, Voxels, Window, carve,
+};
 use maille_volume::{BrickId, BrickSource, BrickedVolume};
 
 /// The bound on a leaf's error is ε₀ itself: what is measured is by how much it is passed. Values of the spline are sums of 64 coefficients in
@@ -40,10 +42,14 @@ impl Bench {
             let measured = octree.measure(bricks);
             self.worse(0, measured.worst_rms - rms);
             self.digest().floats([measured.worst_rms, measured.rms, octree.size().bytes() as f64]);
+            let bytes = octree.to_bytes();
+            let kept = KeptOctree::open(&bytes, bricks.info()).expect("as it was written");
+            let live = kept.live(|_| None);
             for at in places(bricks) {
                 if let Some(value) = octree.value(at) {
                     self.worst[1] += f64::from(u8::from(!value.is_finite()));
                 }
+                self.worst[5] += f64::from(u8::from(live.jet(at) != octree.jet(at)));
             }
         }
     }
@@ -190,18 +196,48 @@ fn the_same_place_again() -> Seen {
     bench.seen()
 }
 
+/// An octree's region that another program has written into: refused, or read without harm; leaves of a brick that are none are not taken.
+fn damaged_bytes() -> Seen {
+    let mut bench = Bench::default();
+    let mut random = Random(23);
+    let bricks = volume([70, 40, 35], [1.0; 3], |v| 300.0 * (v[0] as f64 * 0.3).sin() + 10.0 * v[1] as f64);
+    let octree = Octree::build(&bricks, options(10.0)).expect("a volume that can be fitted");
+    let bytes = octree.to_bytes();
+    for round in 0..200 {
+        let mut wrong = bytes.clone();
+        for _ in 0..3 {
+            // the head and the tables are the small part: there every other time
+            let at = random.below(if round % 2 == 0 { 2000.min(wrong.len()) } else { wrong.len() });
+            wrong[at] = random.below(256) as u8;
+        }
+        if let Ok(kept) = KeptOctree::open(&wrong, bricks.info()) {
+            let live = kept.live(|_| None);
+            let read = places(&bricks).filter(|&at| live.jet(at).is_some()).count();
+            bench.digest().add(read as u64);
+        }
+    }
+    let kept = KeptOctree::open(&bytes, bricks.info()).expect("as it was written");
+    let rubbish: Box<[u8; BRICK_LEAVES_BYTES]> = Box::new(std::array::from_fn(|n| if n == 0 { 1 } else { 0xff }));
+    let live = kept.live(|_| Some(&*rubbish));
+    for at in places(&bricks) {
+        bench.worst[5] += f64::from(u8::from(live.jet(at) != octree.jet(at)));
+    }
+    bench.seen()
+}
+
 const fn case(name: &'static str, effects: &'static [&'static str], run: fn() -> Seen) -> Case {
     Case { engine: "surface", name, effects, invariants: HOLDS, run }
 }
 
 pub(crate) const CASES: &[Case] = &[
-    case("constant values", &["smooth-surface"], constant_values),
+    case("constant values", &["smooth-surface", "octree"], constant_values),
     case("a step", &["smooth-surface"], a_step),
     case("sheets of one voxel", &["smooth-surface"], sheets_of_one_voxel),
-    case("odd sizes", &["smooth-surface"], odd_sizes),
+    case("odd sizes", &["smooth-surface", "octree"], odd_sizes),
     case("commits under the tip", &["smooth-surface"], commits_under_the_tip),
     case("at the border", &["incision"], at_the_border),
     case("the same place again", &["incision"], the_same_place_again),
+    case("damaged bytes", &["octree"], damaged_bytes),
 ];
 
 hard_cases! {
@@ -212,4 +248,5 @@ hard_cases! {
     commits_under_the_tip => 4,
     at_the_border => 5,
     the_same_place_again => 6,
+    damaged_bytes => 7,
 }

@@ -313,7 +313,7 @@ pub static EFFECTS: &[Effect] = &[
         channels: &[&OCTREE],
         stages: &[stage(Process::Deformation, "octree", Per::Step)],
         depends_on: &["smooth-surface"],
-        hard_cases: &["constant values", "odd sizes", "commits under the tip", "damaged bytes"],
+        hard_cases: &["constant values", "odd sizes", "damaged bytes"],
         ..Effect::named(
             "octree",
             "the smooth function that is felt is of an octree of tri-cubics, kept beside the voxels and refitted by every commit",
