@@ -56,8 +56,6 @@ struct Live {
     /// the scene leaves its accuracy to the governor
     governed: bool,
     frames: FrameSubscriber,
-    /// size of the last frame
-    frame_bytes: Option<usize>,
     tool_states: Subscriber<ToolState>,
     commits: Subscriber<Commit>,
     views: Publisher<ViewState>,
@@ -69,7 +67,7 @@ struct Live {
     /// the run stops, or its supervisor has died
     ended: bool,
     // last: ports go before the node they hang on
-    node: Node,
+    _node: Node,
 }
 
 impl Live {
@@ -109,7 +107,6 @@ impl Live {
             live: effects().filter(|e| e.live && scene.has_effect(e.name)).map(|e| e.name).collect(),
             governed: scene.accuracy == Accuracy::Auto,
             frames: node.frame_subscriber()?,
-            frame_bytes: None,
             tool_states: node.subscriber()?,
             commits: node.subscriber()?,
             views: node.publisher()?,
@@ -119,7 +116,7 @@ impl Live {
             frames_counted: 0,
             refused_counted: 0,
             ended: false,
-            node,
+            _node: node,
         })
     }
 
@@ -179,14 +176,6 @@ impl Feed for Live {
     fn frame(&mut self, show: &mut dyn FnMut(&FrameHeader, &[u8])) -> bool {
         let Some(sample) = self.frames.latest() else { return false };
         show(sample.header(), sample.bytes());
-        let bytes = sample.bytes().len();
-        drop(sample);
-        // other views come from another pool, and a port keeps the pools mapped that it has read from: another port takes its place
-        if self.frame_bytes.replace(bytes).is_some_and(|last| last != bytes)
-            && let Ok(frames) = self.node.frame_subscriber()
-        {
-            self.frames = frames;
-        }
         true
     }
 
