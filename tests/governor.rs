@@ -17,10 +17,7 @@ mod device;
 use device::{drive, steps};
 use maille_contact::Grip;
 use maille_contract::{KnobState, Role, ServiceState, control::Counter};
-use maille_scene::{BoxMm, Scene};
-use maille_store::{FREE_PINS, Reader};
 use maille_transport::{ControlMap, Domain};
-use maille_volume::Sampler;
 use rustix::process::Signal;
 use serde_json::Value;
 use std::{
@@ -124,11 +121,7 @@ fn run(scratch: &Scratch, text: &str, programs: usize, seconds: f64) -> Seen {
     for role in [Role::Haptic, Role::Deformation, Role::Rendering].into_iter().filter(|r| deforms || *r != Role::Deformation) {
         eventually("a service is ready", || control.service(role).state() == ServiceState::Ready);
     }
-    let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
-    let told = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
-    let rest = reader.rest();
-    let sampler = Sampler::new(&rest);
-    let way = told.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let way = device::way(&domain);
     let stop = AtomicBool::new(false);
     let given_up = || control.knobs.load::<KnobState>().map_or(0, |(knobs, _)| knobs.given_up);
     let count = || {
@@ -164,7 +157,7 @@ fn run(scratch: &Scratch, text: &str, programs: usize, seconds: f64) -> Seen {
         drop(ending);
         (hand.join().expect("the device works"), rates, most, back)
     });
-    drop((reader, control));
+    drop(control);
     signal(run.pid(), Signal::TERM);
     assert!(run.wait().success(), "{}", run.printed());
     assert_eq!(left_over(domain.name()), [""; 0]);

@@ -21,10 +21,9 @@ use device::{drive, norm, steps};
 use maille_contact::Grip;
 use maille_contract::messages::{DEVICE_VALID, DeviceForce, DeviceState, TOOL_FADING};
 use maille_contract::{Role, ServiceState, ToolState};
-use maille_scene::{BoxMm, Scene};
+use maille_scene::Scene;
 use maille_store::{FREE_PINS, Reader};
 use maille_transport::{ControlMap, Domain, monotonic_ns};
-use maille_volume::Sampler;
 use rustix::process::Signal;
 use service::Service;
 use std::{
@@ -136,10 +135,7 @@ fn a_hand_feels_no_step_while_deformation_or_rendering_is_frozen() {
     let scratch = Scratch::new("haptic-frozen");
     let (run, domain, control) = started(&scratch, &pressing("external", ""), &[]);
     let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
-    let scene = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
-    let rest = reader.rest();
-    let sampler = Sampler::new(&rest);
-    let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let way = device::way(&domain);
     let stop = AtomicBool::new(false);
     /// Ends the device also when the test fails.
     struct Stop<'a>(&'a AtomicBool);
@@ -279,11 +275,8 @@ fn rubbish_from_a_device_is_logged_and_recovered_from_and_no_force_outlives_the_
     let report_path = scratch.file("run.json");
     let more = ["--report", report_path.to_str().expect("a path")];
     let (mut run, domain, control) = started(&scratch, &pressing("external", "[haptic]\nfade_s = 10.0\nmax_slew_n_per_s = 20.0\n"), &more);
-    let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
     let scene = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
-    let rest = reader.rest();
-    let sampler = Sampler::new(&rest);
-    let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let way = device::way(&domain);
     let start = way.at(0.0);
     // into the tissue, along the way's own direction, as far as its deepest point
     let deepest = way.at(0.85).position_mm;
@@ -338,6 +331,6 @@ fn rubbish_from_a_device_is_logged_and_recovered_from_and_no_force_outlives_the_
         assert!(counted > 10 && told == counted && events.len() < 20, "{kind}: {report:#}\n{printed}");
     }
     assert!(printed.contains("jumps of the device") && printed.contains("time went backwards"), "{printed}");
-    drop((reader, control));
+    drop(control);
     assert_eq!(left_over(domain.name()), [""; 0]);
 }

@@ -7,8 +7,10 @@
 use maille_contact::{Device as _, Grip, SimulatedHand};
 use maille_contract::messages::{DEVICE_VALID, DeviceForce, DeviceState};
 use maille_realtime::{Period, enter_realtime};
-use maille_scene::Waypoints;
-use maille_transport::{ControlMap, monotonic_ns};
+use maille_scene::{BoxMm, Scene, Waypoints};
+use maille_store::{FREE_PINS, Reader};
+use maille_transport::{ControlMap, Domain, monotonic_ns};
+use maille_volume::Sampler;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 /// The electronics let go when the last force is older than this [ns]: ten ticks.
@@ -31,6 +33,15 @@ pub struct Felt {
     pub told_n: [f64; 3],
     /// what the motors did: nothing once the watchdog has let go [N]
     pub felt_n: [f64; 3],
+}
+
+/// The way of a run's tool, as its services have it.
+pub fn way(domain: &Domain) -> Waypoints {
+    let reader = Reader::open_with_pins(domain, FREE_PINS).expect("the store");
+    let scene = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
+    let rest = reader.rest();
+    let sampler = Sampler::new(&rest);
+    scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool")
 }
 
 /// Drives the device until `stop`; what it felt.

@@ -18,10 +18,9 @@ use super::{
 };
 use maille_contact::Grip;
 use maille_contract::{Role, ToolState, control::Counter};
-use maille_scene::{BoxMm, Scene};
+use maille_scene::Scene;
 use maille_store::{FREE_PINS, Reader};
 use maille_transport::{ControlMap, Domain, monotonic_ns};
-use maille_volume::Sampler;
 use rustix::process::Signal;
 use std::{
     process::Command,
@@ -73,9 +72,7 @@ fn a_hand_feels_no_step_when_a_service_dies_and_nothing_of_the_tissue_changes() 
     let reader = Reader::open_with_pins(&shared, FREE_PINS).expect("the store");
     until("all are ready", &run, || SERVICES.iter().all(|&role| ready(&control, role)));
     let scene = Scene::load(shared.directory().join("scene.toml")).expect("the scene as the services read it");
-    let rest = reader.rest();
-    let sampler = Sampler::new(&rest);
-    let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let way = crate::device::way(&shared);
 
     let stop = AtomicBool::new(false);
     let (felt, done) = std::thread::scope(|scope| {

@@ -5,9 +5,6 @@ use crate::support::{Scratch, eventually, signal};
 use crate::{STEP_N, ended, pressing, started, tool};
 use maille_contact::Grip;
 use maille_contract::{Role, ServiceState};
-use maille_scene::{BoxMm, Scene};
-use maille_store::{FREE_PINS, Reader};
-use maille_volume::Sampler;
 use rustix::process::Signal;
 use std::{
     sync::atomic::{AtomicBool, Ordering::Relaxed},
@@ -18,11 +15,7 @@ use std::{
 fn a_haptic_process_that_is_asked_to_end_fades_first_and_is_started_again() {
     let scratch = Scratch::new("haptic-asked");
     let (run, domain, control) = started(&scratch, &pressing("external", ""), &[]);
-    let reader = Reader::open_with_pins(&domain, FREE_PINS).expect("the store");
-    let scene = Scene::load(domain.directory().join("scene.toml")).expect("the scene as the services read it");
-    let rest = reader.rest();
-    let sampler = Sampler::new(&rest);
-    let way = scene.resolve_path(&BoxMm::of(&reader.info().grid), |at| sampler.value(at)).expect("a way").expect("a tool");
+    let way = crate::device::way(&domain);
     let stop = AtomicBool::new(false);
     let signals = [Signal::INT, Signal::TERM, Signal::HUP];
     let felt = std::thread::scope(|scope| {
@@ -43,7 +36,7 @@ fn a_haptic_process_that_is_asked_to_end_fades_first_and_is_started_again() {
         let felt = hand.join().expect("the device works");
         asked.map(|()| felt).unwrap_or_else(|panic| std::panic::resume_unwind(panic))
     });
-    drop((reader, control));
+    drop(control);
     ended(run, &domain);
     let largest = steps(&felt).map(|(_, step)| step).fold(0.0, f64::max);
     for ended in 1..=signals.len() as u64 {

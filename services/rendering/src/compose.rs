@@ -153,17 +153,19 @@ impl Composer {
             ..Extras::default()
         };
         let start = monotonic_ns();
-        let carried = warp.filter(|_| self.scheme == WarpScheme::Resample).map(|warp| carried(source, warp, &settings));
-        if let Some((baked, skip)) = &carried {
+        let fewer = [w, h] != [whole.width, whole.height];
+        if fewer {
             self.coarse.resize(w, h);
+        }
+        let into = if fewer { &mut self.coarse } else { &mut *whole };
+        if let Some(warp) = warp.filter(|_| self.scheme == WarpScheme::Resample) {
+            let (baked, skip) = carried(source, warp, &settings);
             let extras = Extras { warp: None, labels: None, zoom: false, ..extras };
-            render_extra(&extras, baked, skip, &camera, &settings, &mut self.coarse)?;
-            enlarge(&self.coarse, whole);
-        } else if [w, h] == [whole.width, whole.height] {
-            self.backend.render(&extras, source, skip, &camera, &settings, whole)?;
+            render_extra(&extras, &baked, &skip, &camera, &settings, into)?;
         } else {
-            self.coarse.resize(w, h);
-            self.backend.render(&extras, source, skip, &camera, &settings, &mut self.coarse)?;
+            self.backend.render(&extras, source, skip, &camera, &settings, into)?;
+        }
+        if fewer {
             enlarge(&self.coarse, whole);
         }
         self.view_ns = monotonic_ns() - start;

@@ -177,22 +177,6 @@ impl Node {
         slope: f64,
         now: &Circumstances<'_>,
     ) -> Felt {
-        let felt = self.pressed(tissue, (x, velocity), search, slope, now);
-        self.indentation_mm = felt.contact.map_or(0.0, |(_, indentation)| indentation);
-        if felt.contact.is_none() {
-            self.slope_n_per_mm = 0.0;
-        }
-        felt
-    }
-
-    fn pressed<S: Surface + ?Sized>(
-        &mut self,
-        tissue: &S,
-        (x, velocity): (V3, V3),
-        search: bool,
-        slope: f64,
-        now: &Circumstances<'_>,
-    ) -> Felt {
         let radius = self.proxy.radius_mm();
         let was_felt = self.last_point.is_some();
         if now.jumped {
@@ -232,6 +216,7 @@ impl Node {
         self.last_point = Some(point);
         felt.at = point;
         felt.contact = Some((contact, delta));
+        self.indentation_mm = delta;
         let force = self.law(tissue, (point, normal, delta), velocity, slope, now, &mut felt);
         if blend.is_none() {
             felt.granted_mj = (self.bias - bias).max(0.0) * force.dot(&normal).max(0.0);
@@ -328,6 +313,7 @@ impl Node {
         self.gap = 0.0;
         self.last_point = None;
         self.material = None;
+        (self.indentation_mm, self.slope_n_per_mm) = (0.0, 0.0);
         self.friction.release();
     }
 }

@@ -10,11 +10,17 @@
 //! so no sample leaves the range of its voxels and skipping stays safe.
 #![allow(unsafe_code)]
 
+mod seen;
+mod warped;
+
+pub use seen::Packet;
+use warped::{beyond, outside_lanes};
+
 use crate::{
     frame::{Frame, REFINEMENTS},
     lanes::{Float, Int, Lanes, MOST, Mask},
     render::{Ends, Stage},
-    scalar::{Seen, ZERO_GRADIENT},
+    scalar::ZERO_GRADIENT,
     settings::Mode,
     skip::GENTLE,
     warp::{Bend, Led, Tile},
@@ -33,33 +39,6 @@ const WEIGHT: f32 = 16384.0;
 const _: () = assert!((EDGE - 1 + 3) * (SLICE + ROW + 1) < STORED && EDGE - 1 + 3 < STORED_EDGE);
 // brick and cell numbers are found by multiplication with the inverse
 const _: () = assert!(CELL.is_power_of_two());
-
-/// What a packet saw.
-pub struct Packet {
-    color: [[f32; MOST]; 3],
-    transmittance: [f32; MOST],
-    depth: [f32; MOST],
-}
-
-impl Packet {
-    #[inline]
-    pub fn lane(&self, n: usize) -> Seen {
-        Seen { color: [self.color[0][n], self.color[1][n], self.color[2][n]], transmittance: self.transmittance[n], depth: self.depth[n] }
-    }
-}
-
-impl Packet {
-    /// Red, green and blue bytes of all lanes before what is behind them.
-    #[inline]
-    pub fn bytes(&self, behind: [f32; 3]) -> [[u8; MOST]; 3] {
-        std::array::from_fn(|c| {
-            std::array::from_fn(|n| {
-                let v = self.color[c][n] + self.transmittance[n] * behind[c];
-                (v * 255.0 + 0.5).clamp(0.0, 255.0) as u8
-            })
-        })
-    }
-}
 
 /// Rays of a packet; fields as in [`crate::frame::Ray`].
 struct Rays<L: Lanes> {
@@ -350,61 +329,6 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
         unsafe { self.l.entries(entries, index) }
     }
 
-    /// Where samples are looked up: on the ray, or where the warp takes them.
-    #[inline(always)]
-    fn bent(&mut self, q: L::Float, alive: L::Mask) -> [L::Float; 3] {
-        match &mut self.bend {
-            Some(bend) => bend.bend(self.l, q, alive),
-            None => {
-                let x = self.rays.at(q);
-                match &mut self.led {
-                    Some(led) => led.lead(self.l, &x, q, &self.rays.delta, alive),
-                    None => x,
-                }
-            }
-        }
-    }
-
-    /// Whether some samples are to be found one by one.
-    #[inline(always)]
-    fn is_exact(&self) -> bool {
-        self.bend.as_ref().is_some_and(Bend::is_exact)
-    }
-
-    /// Samples at q that the lattices of a warp take to p, found one by one where those do not suffice and the map's `state` does not say that all around is empty;
-    /// and which lanes those are.
-    #[inline(always)]
-    fn settled(&self, q: L::Float, p: &[L::Float; 3], state: Option<L::Int>, lanes: L::Mask) -> ([L::Float; 3], L::Mask) {
-        let Some(bend) = &self.bend else { return (*p, lanes & !lanes) };
-        let x = self.rays.at(q);
-        let mut rough = bend.rough(self.l, &x, lanes);
-        if let Some(state) = state {
-            rough = rough & !bend.is_far(self.l, self.frame, state, p);
-        }
-        if !rough.any() {
-            return (*p, rough);
-        }
-        (bend.settle(self.l, &x, p, rough), rough)
-    }
-
-    /// [`Self::bent`], and found one by one where that does not suffice.
-    #[inline(always)]
-    fn exactly(&mut self, q: L::Float, alive: L::Mask) -> [L::Float; 3] {
-        let p = self.bent(q, alive);
-        if self.is_exact() { self.settled(q, &p, None, alive).0 } else { p }
-    }
-
-    /// Steps from samples in empty cells of distance d to where their boxes of empty cells end.
-    #[inline(always)]
-    fn way_out(&self, d: L::Int, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
-        match &self.bend {
-            Some(bend) => bend.way_out(self.l, d.float(), corner, p),
-            // a lead is as good as the sample before
-            None if self.led.is_some() => self.l.set(0.0),
-            None => self.box_exit(&self.inverse, d.float(), corner, p),
-        }
-    }
-
     /// Steps along a straight ray to the end of the box of empty cells, d − 1 cells beyond its cell on every side.
     #[inline(always)]
     fn box_exit(&self, inverse: &[L::Float; 3], d: L::Float, corner: &[L::Float; 3], p: &[L::Float; 3]) -> L::Float {
@@ -651,53 +575,6 @@ impl<L: Lanes, S: BrickSource + ?Sized> Walker<'_, '_, '_, L, S> {
         let place = self.place(&p);
         let inner = self.inner(&place);
         self.value(&place, &inner)
-    }
-}
-
-/// Which lanes the warp has taken out of the volume, to p, and how many steps they stay outside at least, from where the lattices led.
-#[inline(always)]
-fn outside_lanes<L: Lanes>(l: L, frame: &Frame, bend: &Bend<'_, '_, L>, p: &[L::Float; 3], led: &[L::Float; 3]) -> (L::Mask, L::Float) {
-    let mut gap = l.set(0.0);
-    for (c, &p) in led.iter().enumerate() {
-        let [forwards, backwards] = bend.slowest()[c];
-        let astray = bend.astray()[c];
-        gap = gap.max((l.set(-astray) - p) * forwards).max((p - l.set(frame.last[c] + astray)) * backwards);
-    }
-    let mut outside = l.set(0.0).lt(gap);
-    if bend.is_exact() {
-        outside = outside | beyond(l, frame, p);
-    }
-    (outside, gap)
-}
-
-/// Which lanes are out of the volume.
-#[inline(always)]
-fn beyond<L: Lanes>(l: L, frame: &Frame, p: &[L::Float; 3]) -> L::Mask {
-    let mut outside = l.set(1.0).lt(l.set(0.0));
-    for (c, &p) in p.iter().enumerate() {
-        outside = outside | p.lt(l.set(0.0)) | l.set(frame.last[c]).lt(p);
-    }
-    outside
-}
-
-impl Packet {
-    /// What is left behind an opaque ray is taken to look like what was seen.
-    fn saturate(&mut self, opaque: f32) {
-        for n in 0..MOST {
-            if self.transmittance[n] < opaque {
-                let whole = 1.0 / (1.0 - self.transmittance[n]);
-                self.color.iter_mut().for_each(|c| c[n] *= whole);
-                self.transmittance[n] = 0.0;
-            }
-        }
-    }
-
-    /// Dense bright.
-    fn transmit(&mut self, attenuation: &[f32; MOST]) {
-        for n in 0..MOST {
-            self.transmittance[n] = (-attenuation[n]).exp();
-            self.color.iter_mut().for_each(|c| c[n] = 1.0 - self.transmittance[n]);
-        }
     }
 }
 
