@@ -328,6 +328,69 @@ fn images_of_a_breath_become_models_that_bring_it_back() {
     let scaled = VectorField { grid: third.grid.clone(), vectors: third.vectors.iter().map(|v| v.map(|c| 1.2 * c)).collect() };
     assert!(between(&deeper, &scaled) < 1e-2);
 
+    // fields of other tools are judged as far as fields can be: against an oracle of their own here
+    let worst = |report: &serde_json::Value, n: usize| report["phases"][n]["way_back_mm"]["worst"].as_f64().unwrap();
+    assert!(report["phases"][2]["rms_hu"].is_null() && report["phases"][2]["folded_cells"] == 0, "{report}");
+    assert!((0..4).all(|n| worst(&report, n) < 0.02) && worst(&report, 2) > 0.0, "{report}");
+    assert!((report["phases"][2]["longest_mm"].as_f64().unwrap() - said["longest_mm"].as_f64().unwrap()).abs() < 1e-2);
+
+    // both ways, by a mask that is given, and by landmarks that move as the formula does
+    let mask = scratch.file("mask.mha");
+    let mut ball = breath(0.0);
+    ball.values.iter_mut().for_each(|v| *v = f32::from(u8::from(*v < -400.0)));
+    write_image(Path::new(&mask), &ball.to_image()).unwrap();
+    // both poles of the ball, which grows by 3/20 along z
+    let points = |name: &str, stretch: f64| {
+        let center = ball.grid.center();
+        let rows: String = (0..20)
+            .map(|n| {
+                let (sin, cos) = (0.6 * f64::from(n)).sin_cos();
+                let (x, y) = (0.3 * f64::from(n) * cos, 0.3 * f64::from(n) * sin);
+                let z = (256.0 - x * x - y * y).sqrt() * if n % 2 == 0 { stretch } else { -stretch };
+                format!("{} {} {}\n", center[0] + x, center[1] + y, center[2] + z)
+            })
+            .collect();
+        std::fs::write(scratch.file(name), format!("point\n20\n{rows}")).unwrap();
+        scratch.file(name)
+    };
+    let (rest, there) = (points("rest.txt", 1.0), points("there.txt", 1.15));
+    let sliding = fit(&["-o", &scratch.file("s.motion"), "--sliding", "--mask", &mask, "--consistency", "--landmarks", "2", &rest, &there]);
+    assert_ne!(std::fs::read(scratch.file("s.motion")).unwrap(), std::fs::read(&full).unwrap(), "what slides makes a difference");
+    let second = &sliding["phases"][1];
+    let number = |key: &str| second.pointer(key).unwrap().as_f64().unwrap();
+    // a ball of 32 mm that moves by 3 mm: a voxel of 2 mm is what both ways must agree to
+    assert!(number("/consistency_mm/count") > 1000.0 && number("/consistency_mm/p95") < 2.0, "{second}");
+    assert!(number("/consistency_mm/mean") > 0.0 && sliding["phases"][0]["consistency_mm"].is_null(), "{second}");
+    assert_eq!(second.pointer("/landmarks/after_mm/count").unwrap(), 20);
+    assert!(number("/landmarks/after_mm/mean") < 0.5 * number("/landmarks/before_mm/mean"), "{second}");
+    assert!(sliding["phases"][2]["landmarks"].is_null());
+    let refuse = |status: i32, more: &[&str], says: &str| {
+        refused(&[&["motion", "fit"], &phases[..], &["-o", &scratch.file("no.motion")], more].concat(), status, says);
+    };
+    refuse(2, &["--mask", &mask], "--sliding");
+    refuse(2, &["--landmarks", "9", &rest, &there], "1 to 4");
+    refuse(2, &["--pca", "0"], "--pca 0");
+    refuse(2, &["--pca", "1.5"], "--pca 1.5");
+    std::fs::write(scratch.file("bare.txt"), "1 2 3\n").unwrap();
+    refuse(1, &["--landmarks", "2", &rest, &scratch.file("bare.txt")], "bare.txt: nothing says what its numbers are");
+    let empty = scratch.file("empty.mha");
+    write_image(Path::new(&empty), &ScalarField { values: vec![0.0; ball.values.len()], grid: ball.grid.clone() }.to_image()).unwrap();
+    refuse(1, &["--sliding", "--mask", &empty], "empty.mha: none of its voxels is above 0");
+    write_image(
+        Path::new(&empty),
+        &ScalarField { values: ball.values.clone(), grid: Grid { origin: [900.0; 3], ..ball.grid.clone() } }.to_image(),
+    )
+    .unwrap();
+    refuse(1, &["--sliding", "--mask", &empty], "it lies elsewhere");
+
+    // two principal components of fields that one depth makes: nearly all there is, told, and what is written is less than all
+    let filtered = scratch.file("pca.motion");
+    let pca = |keep: &str| fit(&["-o", &filtered, "--pca", keep])["pca"].clone();
+    let (two, share) = (pca("2"), pca("0.5"));
+    assert!(two["components"] == 2 && two["kept"].as_f64().unwrap() > 0.9 && two["removed_mm"].as_f64().unwrap() > 0.0, "{two}");
+    assert!(share["components"] == 1 && share["kept"].as_f64().unwrap() > 0.5 && share["mean_rms_hu"].as_f64().unwrap() > 1.0, "{share}");
+    assert!(between(&eval(&filtered, &["--phase", "3"]).0, &third) > 1e-3);
+
     // signals: linear in them
     let surrogate = scratch.file("surrogate.motion");
     told(&[&["motion", "fit"], &of_fields[..], &["-o", &surrogate, "--kind", "surrogate"], &with].concat());
@@ -384,6 +447,7 @@ fn phases_that_make_no_motion_are_refused_in_one_sentence() {
     fit(&[&a, &a, "--reference", "0"], 2, "from 1");
     fit(&[&a, &a, "--cycle", "-1"], 2, "--cycle");
     fit(&[&u, &u, "--sliding"], 2, "--sliding");
+    fit(&[&u, &u, "--consistency"], 2, "--consistency");
     fit(&[&u, &u, "--kind", "surrogate"], 2, "--signals");
     // twice the same image: no breath
     fit(&[&a, &a, "--kind", "half"], 1, "the same in all phases");

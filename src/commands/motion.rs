@@ -3,14 +3,19 @@
 //! Phases are given in the order of the breathing cycle, evenly spaced in it. Images are registered to the reference; fields are taken as
 //! they are (reference → phase, LPS mm). The signal of a phase is the air in its image [ml] and the rate of that, or what `--signals` says.
 
-use super::invert::{sound_field, writable};
+mod eval;
+mod read;
+mod tell;
+
 use super::{Failure, Outcome};
-use maille_motion::model::{Collapsed, Kind, Precision, Weights, fit_full_cycle, fit_half_cycle, fit_surrogate};
-use maille_motion::phases::{PhaseOptions, Quality, air_ml, ends, rates, register_phases};
-use maille_motion::{MotionModel, resample::coarsen};
-use maille_volume::io::{ReadOptions, read, write_vector_field};
-use maille_volume::{Grid, Image, ScalarField, VectorField};
-use serde_json::{Value, json};
+use eval::{EvalArgs, eval};
+use maille_motion::MotionModel;
+use maille_motion::model::{Keep, Kind, PcaReport, Precision, RIDGE, filter, fit_full_cycle, fit_half_cycle, fit_surrogate};
+use maille_motion::phases::{PhaseOptions, air_ml, ends, rates, register_phases};
+use maille_motion::quality::{LandmarkErrors, Quality, landmark_errors, quality, rms_hu};
+use maille_motion::resample::{CoarseError, coarsen, jacobian_determinant};
+use maille_volume::{ScalarField, VectorField};
+use read::{Given, read_landmarks, read_mask, read_phases, read_signals};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -49,12 +54,28 @@ struct FitArgs {
     /// let lung and chest wall slide along each other, and keep bone stiff
     #[arg(long)]
     sliding: bool,
+    /// what slides along the rest, above 0 in an image of the reference on any grid; without it, the lungs as they are found there
+    #[arg(long, value_name = "FILE", requires = "sliding")]
+    mask: Option<PathBuf>,
+    /// keep the first principal components of the fields about their mean: so many (2), or as few as hold a share of their variance (0.95)
+    #[arg(long, value_name = "N|SHARE", allow_hyphen_values = true)]
+    pca: Option<f64>,
+    /// register every phase the other way as well, and tell how far both agree: |u(X) + w(X + u(X))| in mm
+    #[arg(long)]
+    consistency: bool,
+    /// points of the reference and of phase N, row by row, to judge the fields by: text that begins with `point` (LPS mm) or `index` (voxels from 0) as of
+    /// elastix, or FILE.mat:VARIABLE of rows [y, x, z] in voxels from 1; may be given several times
+    #[arg(long, num_args = 3, value_names = ["N", "REFERENCE", "PHASE"], action = clap::ArgAction::Append)]
+    landmarks: Vec<String>,
     /// signals of the phases: one line a phase, g, then g' and others, separated by commas or blanks; without it, the air in the images
     #[arg(long, value_name = "FILE")]
     signals: Option<PathBuf>,
     /// duration of the cycle, for the rate of the air in the images [s]
     #[arg(long, value_name = "S", default_value_t = 4.0, allow_hyphen_values = true)]
     cycle: f64,
+    /// share of its own variance that each signal of a surrogate is credited with as noise: with 0 the phases given are met best, with the default those between
+    #[arg(long, value_name = "SHARE", default_value_t = RIDGE, allow_hyphen_values = true)]
+    ridge: f64,
     /// how numbers are stored: 16-bit steps, half or single precision
     #[arg(long, value_enum, default_value_t = Stored::I16)]
     precision: Stored,
@@ -64,35 +85,6 @@ struct FitArgs {
     /// print one JSON object: what every field is worth, and the model
     #[arg(long)]
     json: bool,
-}
-
-#[derive(clap::Args)]
-struct EvalArgs {
-    /// a model that `maille motion fit` wrote
-    model: PathBuf,
-    #[command(flatten)]
-    moment: Moment,
-    /// where to write the displacement, reference to now (.nrrd, .mha, .mhd, .nii, .nii.gz)
-    #[arg(short, long, value_name = "U.nrrd")]
-    output: PathBuf,
-    /// print one JSON object: coefficients, longest displacement, error of storage
-    #[arg(long)]
-    json: bool,
-}
-
-// which moment: one of these
-#[derive(clap::Args)]
-#[group(required = true, multiple = false)]
-struct Moment {
-    /// a key frame of the model, counted from 1: of a full cycle, the phases as they were given; of a half cycle, from inspiration
-    #[arg(long, value_name = "N")]
-    phase: Option<usize>,
-    /// place in a full cycle (0 to 1, round and round), or between end of inspiration (0) and of expiration (1), and beyond
-    #[arg(long, value_name = "T", allow_hyphen_values = true)]
-    tau: Option<f64>,
-    /// the signals of a surrogate model: g, then g' and others
-    #[arg(long, value_name = "G,G'", value_delimiter = ',', allow_hyphen_values = true)]
-    signal: Option<Vec<f64>>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -120,12 +112,6 @@ pub fn run(args: &Args) -> Outcome {
     }
 }
 
-/// The phases as they were read: all images, or all fields.
-enum Given {
-    Images(Vec<ScalarField>),
-    Fields(Vec<VectorField>),
-}
-
 fn refused(fault: impl std::fmt::Display) -> Failure {
     Failure::Refused(fault.to_string())
 }
@@ -140,20 +126,26 @@ fn fit(args: &FitArgs) -> Outcome {
     if args.reference == Some(0) {
         return Err(Failure::Usage("--reference counts phases from 1".into()));
     }
+    if !(0.0..1.0).contains(&args.ridge) {
+        return Err(Failure::Usage(format!("--ridge {} is no share of a variance; give 0 to below 1", args.ridge)));
+    }
+    let keep = args.pca.map(keep).transpose()?;
     let start = Instant::now();
     let given = read_phases(&args.phases)?;
-    let images = matches!(given, Given::Images(_));
-    let (fields, qualities, air) = match given {
+    let (images, fields, qualities) = match given {
         Given::Images(images) => {
-            let air: Vec<f64> = images.iter().map(air_ml).collect();
             let (fields, qualities) = registered(args, &images)?;
-            (fields, qualities, Some(air))
+            (Some(images), fields, qualities)
         }
         Given::Fields(fields) => {
-            if args.sliding {
-                return Err(Failure::Usage("--sliding is for images; displacement fields are taken as they are".into()));
+            for (given, option) in [(args.sliding, "--sliding"), (args.consistency, "--consistency")] {
+                if given {
+                    return Err(Failure::Usage(format!("{option} is for images; displacement fields are taken as they are")));
+                }
             }
-            (with_reference(args, fields)?, Vec::new(), None)
+            let fields = with_reference(args, fields)?;
+            let qualities = fields.iter().map(|u| quality(None, u)).collect::<Result<_, _>>().map_err(refused)?;
+            (None, fields, qualities)
         }
     };
     let count = fields.len();
@@ -161,18 +153,27 @@ fn fit(args: &FitArgs) -> Outcome {
         return Err(Failure::Refused(format!(
             "{} is one phase; a motion needs two or more{}",
             args.phases[0].display(),
-            if images { "" } else { " (--reference N adds the one without a file)" }
+            if images.is_some() { "" } else { " (--reference N adds the one without a file)" }
         )));
     }
-    let signals = match (&args.signals, air) {
+    let landmarks = landmarks(args, &fields)?;
+    let signals = match (&args.signals, &images) {
         (Some(path), _) => Some(read_signals(path, count)?),
-        (None, Some(air)) => {
+        (None, Some(images)) => {
+            let air: Vec<f64> = images.iter().map(air_ml).collect();
             let rate = rates(&air, args.cycle);
             Some(air.iter().zip(rate).map(|(&g, rate)| vec![g, rate]).collect())
         }
         (None, None) => None,
     };
-    let given_fields = fields.len();
+    let (fields, filtered) = match keep {
+        Some(keep) => {
+            let (fields, found) = filter(&fields, keep).map_err(refused)?;
+            let filtered = Filtered::of(found, &fields, images.as_deref(), reference(args));
+            (fields, Some(filtered))
+        }
+        None => (fields, None),
+    };
     let (fields, coarse) = match args.coarsen {
         Some(tolerance) => {
             let (coarse, error) = coarsen(&fields, tolerance);
@@ -182,63 +183,73 @@ fn fit(args: &FitArgs) -> Outcome {
     };
     let (model, used) = model_of(args, &fields, signals.as_deref())?;
     write_model(&args.output, &model)?;
-
-    let seconds = start.elapsed().as_secs_f64();
-    let used: Vec<usize> = used.iter().map(|n| n + 1).collect();
-    let judged: Vec<f64> = qualities.iter().enumerate().filter(|(n, _)| *n != reference(args)).map(|(_, q)| q.rms_hu[1]).collect();
-    let mean = (!judged.is_empty()).then(|| judged.iter().sum::<f64>() / judged.len() as f64);
-    if args.json {
-        let phases: Vec<Value> = (0..given_fields).map(|n| describe(n, qualities.get(n), signals.as_ref().map(|s| &s[n]))).collect();
-        println!(
-            "{}",
-            json!({
-                "output": args.output.display().to_string(),
-                "kind": kind_name(model.kind()),
-                "places": places(model.kind()),
-                "phases": phases,
-                "used_phases": used,
-                "reference": args.reference.or(images.then_some(1)),
-                "mean_rms_hu": mean,
-                "size": model.grid().size,
-                "spacing": model.grid().spacing,
-                "fields": model.fields().len(),
-                "size_bytes": model.size_bytes(),
-                "storage_error_mm": model.fields().iter().map(|f| f.error_mm()).fold(0.0, f32::max),
-                "coarse_error_mm": coarse.map(|e| json!({ "p99": e.p99_mm, "worst": e.worst_mm })),
-                "seconds": seconds,
-            })
-        );
-        return Ok(());
-    }
-    for (n, q) in qualities.iter().enumerate() {
-        if n == reference(args) {
-            println!("phase {:2}: reference", n + 1);
-            continue;
-        }
-        println!(
-            "phase {:2}: RMS {:.1} → {:.1} HU, up to {:.1} mm, det J {:.3} … {:.3}, {} cells folded, {} nodes without inverse",
-            n + 1,
-            q.rms_hu[0],
-            q.rms_hu[1],
-            q.longest_mm,
-            q.determinant[0],
-            q.determinant[1],
-            q.folded,
-            q.without_inverse
-        );
-    }
-    if let Some(mean) = mean {
-        println!("mean RMS {mean:.2} HU");
-    }
-    let [x, y, z] = model.grid().size;
-    println!(
-        "{}: {} of phases {used:?}, {} fields of {x} × {y} × {z}, {:.1} MiB, {seconds:.1} s",
-        args.output.display(),
-        kind_name(model.kind()),
-        model.fields().len(),
-        model.size_bytes() as f64 / f64::from(1 << 20)
-    );
+    let fitted = Fitted {
+        model,
+        used,
+        images: images.is_some(),
+        qualities,
+        landmarks,
+        signals,
+        filtered,
+        coarse,
+        seconds: start.elapsed().as_secs_f64(),
+    };
+    fitted.tell(args);
     Ok(())
+}
+
+/// A model, and all that is said about it.
+struct Fitted {
+    model: MotionModel<'static>,
+    /// phases that it is made of
+    used: Vec<usize>,
+    /// whether it comes from images
+    images: bool,
+    qualities: Vec<Quality>,
+    /// of each phase that has some
+    landmarks: Vec<Option<LandmarkErrors>>,
+    signals: Option<Vec<Vec<f64>>>,
+    filtered: Option<Filtered>,
+    coarse: Option<CoarseError>,
+    seconds: f64,
+}
+
+/// What the filter by principal components did.
+struct Filtered {
+    report: PcaReport,
+    /// over the phases but the reference, as [`Quality::rms_hu`]
+    mean_rms_hu: Option<f64>,
+    /// cells with det J ≤ 0, in all fields
+    folded: usize,
+}
+
+impl Filtered {
+    fn of(report: PcaReport, fields: &[VectorField], images: Option<&[ScalarField]>, reference: usize) -> Self {
+        let others = || (0..fields.len()).filter(|n| *n != reference);
+        let mean = |images: &[ScalarField]| {
+            others().map(|n| rms_hu(&images[reference], &images[n], Some(&fields[n]))).sum::<f64>() / others().count() as f64
+        };
+        let folded = |u: &VectorField| jacobian_determinant(u).values.iter().filter(|d| **d <= 0.0).count();
+        Self { report, mean_rms_hu: images.map(mean), folded: fields.iter().map(folded).sum() }
+    }
+}
+
+/// How much is kept: a count, or a share below 1.
+fn keep(given: f64) -> Result<Keep, Failure> {
+    match given {
+        share if share > 0.0 && share < 1.0 => Ok(Keep::Share(share)),
+        count if count >= 1.0 && count.fract() == 0.0 => Ok(Keep::Components(count as usize)),
+        _ => Err(Failure::Usage(format!("--pca {given} is neither a number of components (1, 2, …) nor a share of the variance below 1"))),
+    }
+}
+
+/// What landmarks say of the fields.
+fn landmarks(args: &FitArgs, fields: &[VectorField]) -> Result<Vec<Option<LandmarkErrors>>, Failure> {
+    let mut pairs: Vec<Vec<[[f64; 3]; 2]>> = vec![Vec::new(); fields.len()];
+    for given in read_landmarks(&args.landmarks, fields.len(), &fields[0].grid)? {
+        pairs[given.phase].extend(given.pairs);
+    }
+    Ok(pairs.iter().zip(fields).map(|(pairs, u)| (!pairs.is_empty()).then(|| landmark_errors(u, pairs))).collect())
 }
 
 /// Index of the reference among the phases.
@@ -264,7 +275,8 @@ fn registered(args: &FitArgs, images: &[ScalarField]) -> Result<(Vec<VectorField
             size[2]
         )));
     }
-    let options = PhaseOptions { sliding: args.sliding, ..PhaseOptions::default() };
+    let mask = args.mask.as_deref().map(|path| read_mask(path, &images[reference(args)].grid)).transpose()?;
+    let options = PhaseOptions { sliding: args.sliding, mask, consistency: args.consistency, ..PhaseOptions::default() };
     let mut at_work = usize::MAX;
     let progress = |phase: usize, _: usize, _: usize| {
         if phase != at_work {
@@ -324,7 +336,9 @@ fn model_of(args: &FitArgs, fields: &[VectorField], signals: Option<&[Vec<f64>]>
             let places: Vec<f64> = all.iter().map(|&n| n as f64 / (count - 1) as f64).collect();
             fit_half_cycle(fields, &places, precision)
         }
-        (ModelKind::Surrogate, Some(level), Some(signals)) => fit_surrogate(fields, signals, ends(level).map(|n| level[n]), precision),
+        (ModelKind::Surrogate, Some(level), Some(signals)) => {
+            fit_surrogate(fields, signals, ends(level).map(|n| level[n]), args.ridge, precision)
+        }
         (ModelKind::Surrogate, ..) => {
             return Err(Failure::Usage("a surrogate model of displacement fields needs --signals: fields alone hold no signal".into()));
         }
@@ -351,18 +365,6 @@ fn out_branch(level: &[f64]) -> (Vec<usize>, Vec<f64>) {
     (branch, places)
 }
 
-fn describe(n: usize, quality: Option<&Quality>, signal: Option<&Vec<f64>>) -> Value {
-    json!({
-        "phase": n + 1,
-        "signal": signal,
-        "rms_hu": quality.map(|q| q.rms_hu),
-        "determinant": quality.map(|q| q.determinant),
-        "folded_cells": quality.map(|q| q.folded),
-        "without_inverse": quality.map(|q| q.without_inverse),
-        "longest_mm": quality.map(|q| q.longest_mm),
-    })
-}
-
 fn kind_name(kind: &Kind) -> &'static str {
     match kind {
         Kind::FullCycle { .. } => "full cycle",
@@ -378,105 +380,6 @@ fn places(kind: &Kind) -> Option<&[f64]> {
     }
 }
 
-/// Reads all phases: one sort, one grid, finite numbers.
-fn read_phases(paths: &[PathBuf]) -> Result<Given, Failure> {
-    let (mut images, mut fields): (Vec<ScalarField>, Vec<VectorField>) = (Vec::new(), Vec::new());
-    let mut first: Option<(&Path, Grid)> = None;
-    for path in paths {
-        let reading = read(path, &ReadOptions::default()).map_err(refused)?;
-        for notice in &reading.notices {
-            eprintln!("maille: {}: {notice}", path.display());
-        }
-        let image = reading.image;
-        let grid = match &first {
-            None => first.insert((path, image.grid.clone())).1.clone(),
-            Some((other, grid)) => {
-                one_place(path, &image.grid, other, grid)?;
-                grid.clone()
-            }
-        };
-        match image.components {
-            1 => images.extend(frames(path, &image, &grid)?),
-            3 => fields.push(VectorField { grid, ..sound_field(path, &image)? }),
-            n => {
-                return Err(Failure::Refused(format!(
-                    "{}: it has {n} components a voxel; a phase is an image (1) or a displacement field (3)",
-                    path.display()
-                )));
-            }
-        }
-        if !images.is_empty() && !fields.is_empty() {
-            let (other, _) = first.as_ref().expect("one file has been read");
-            return Err(Failure::Refused(format!(
-                "{} and {} are an image and a displacement field; give images of all phases, or fields of all",
-                other.display(),
-                path.display()
-            )));
-        }
-    }
-    Ok(if fields.is_empty() { Given::Images(images) } else { Given::Fields(fields) })
-}
-
-/// Refuses grids that are not one, up to what files round.
-fn one_place(path: &Path, grid: &Grid, other: &Path, expected: &Grid) -> Outcome {
-    let last = expected.size.map(|s| s as f64 - 1.0);
-    let corner = |n: usize| std::array::from_fn(|c| if n >> c & 1 == 1 { last[c] } else { 0.0 });
-    let apart = (0..8).map(|n| {
-        let (a, b) = (grid.world_from_index(corner(n)), expected.world_from_index(corner(n)));
-        (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>().sqrt()
-    });
-    if grid.size == expected.size && apart.fold(0.0, f64::max) <= 1e-2 * expected.min_spacing() {
-        return Ok(());
-    }
-    let told = |g: &Grid| format!("{:?} voxels of {:?} mm from {:?}", g.size, g.spacing, g.origin);
-    Err(Failure::Refused(format!(
-        "{} and {} do not lie on one grid: {} and {}; resample them to one",
-        other.display(),
-        path.display(),
-        told(expected),
-        told(grid)
-    )))
-}
-
-/// The frames of an image, one a phase.
-fn frames(path: &Path, image: &Image, grid: &Grid) -> Result<Vec<ScalarField>, Failure> {
-    let values: Vec<f32> = image.pixels.iter_f64().map(|v| image.rescale.value(v) as f32).collect();
-    if let Some(at) = values.iter().position(|v| !v.is_finite()) {
-        let count = values.iter().filter(|v| !v.is_finite()).count();
-        return Err(Failure::Refused(format!(
-            "{}: {count} of its values are not finite, the first is number {at}; fill them in first (air is -1000 HU)",
-            path.display()
-        )));
-    }
-    Ok(values.chunks_exact(grid.voxel_count()).map(|v| ScalarField { grid: grid.clone(), values: v.to_vec() }).collect())
-}
-
-/// Signals, one line a phase; lines that are empty or begin with # are left out.
-fn read_signals(path: &Path, phases: usize) -> Result<Vec<Vec<f64>>, Failure> {
-    let text = std::fs::read_to_string(path).map_err(|e| Failure::Refused(format!("{} cannot be read: {e}", path.display())))?;
-    let mut rows: Vec<Vec<f64>> = Vec::new();
-    for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#')) {
-        let number = |v: &str| v.parse::<f64>().ok().filter(|v| v.is_finite());
-        // beside a semicolon or a tab a comma is decimal; alone, or with blanks, it separates
-        let decimal = line.contains([';', '\t']);
-        let point = if decimal { line.replace(',', ".") } else { line.to_owned() };
-        let row: Option<Vec<f64>> = point.split([',', ';', ' ', '\t']).filter(|v| !v.is_empty()).map(number).collect();
-        let row = row.filter(|row| !row.is_empty() && rows.first().is_none_or(|first| first.len() == row.len()));
-        rows.push(row.ok_or_else(|| {
-            Failure::Refused(format!(
-                "{}, line {}: `{}` is not a row of finite numbers as long as the first; write g, g' of one phase a line",
-                path.display(),
-                n + 1,
-                line.trim()
-            ))
-        })?);
-    }
-    if rows.len() != phases {
-        return Err(Failure::Refused(format!("{} has signals of {} phases, {phases} phases were given", path.display(), rows.len())));
-    }
-    Ok(rows)
-}
-
 /// Writes a model; it appears under its name only when it is complete.
 fn write_model(path: &Path, model: &MotionModel) -> Outcome {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
@@ -486,72 +389,6 @@ fn write_model(path: &Path, model: &MotionModel) -> Outcome {
         let _ = std::fs::remove_file(&temporary);
         Failure::Refused(format!("{} cannot be written: {e}", path.display()))
     })
-}
-
-fn eval(args: &EvalArgs) -> Outcome {
-    writable(&args.output)?;
-    let name = args.model.display();
-    let bytes = std::fs::read(&args.model).map_err(|e| Failure::Refused(format!("{name} cannot be read: {e}")))?;
-    let model = MotionModel::view(&bytes).map_err(|e| Failure::Refused(format!("{name}: {e}; give what `maille motion fit` wrote")))?;
-    let weights = moment(&args.moment, model.kind()).map_err(|fault| Failure::Usage(format!("{name}: {fault}")))?;
-    let mut field = VectorField::zeros(model.grid().clone());
-    for (k, c) in weights.iter() {
-        let part = model.fields()[k].unpack(model.grid());
-        field.vectors.iter_mut().zip(part.vectors).for_each(|(sum, v)| (0..3).for_each(|d| sum[d] += c * v[d]));
-    }
-    let longest = field.vectors.iter().map(|v| v.iter().map(|c| c * c).sum::<f32>()).fold(0.0, f32::max).sqrt();
-    // the largest of numbers of which some are none may be one
-    if !longest.is_finite() || !field.vectors.iter().flatten().all(|c| c.is_finite()) {
-        return Err(Failure::Refused(format!(
-            "{name}: displacements at this moment are not finite; give a moment nearer to the model's own"
-        )));
-    }
-    write_vector_field(&args.output, &field).map_err(refused)?;
-    let without_inverse = Collapsed::new(&model, 0.01).update(&model, &weights).unsettled;
-    let error = model.storage_error_mm(&weights);
-    if args.json {
-        println!(
-            "{}",
-            json!({
-                "model": args.model.display().to_string(),
-                "output": args.output.display().to_string(),
-                "kind": kind_name(model.kind()),
-                "weights": weights.dense(model.fields().len()),
-                "longest_mm": longest,
-                "storage_error_mm": error,
-                "without_inverse": without_inverse,
-            })
-        );
-    } else {
-        println!(
-            "{}: displacements up to {longest:.2} mm (stored to {error:.1e} mm), {without_inverse} nodes without inverse",
-            args.output.display()
-        );
-    }
-    Ok(())
-}
-
-/// Coefficients for the moment asked for, or what to ask for instead.
-fn moment(args: &Moment, kind: &Kind) -> Result<Weights, String> {
-    match (kind, places(kind), args.phase, args.tau, &args.signal) {
-        (Kind::Surrogate { signals, .. }, _, _, _, Some(z)) => {
-            if z.len() != *signals || !z.iter().all(|v| v.is_finite()) {
-                return Err(format!(
-                    "the model has {signals} signals; give as many finite numbers, as in --signal={}",
-                    vec!["0"; *signals].join(",")
-                ));
-            }
-            Ok(kind.weights_of(z))
-        }
-        (Kind::Surrogate { .. }, ..) => Err("a surrogate model knows no phases, only signals; give --signal".into()),
-        (_, Some(places), Some(n), _, _) => places
-            .get(n.wrapping_sub(1))
-            .map(|&tau| kind.weights_at(tau))
-            .ok_or_else(|| format!("--phase {n}: the model has key frames 1 to {}", places.len())),
-        (_, _, _, Some(tau), _) if tau.is_finite() => Ok(kind.weights_at(tau)),
-        (_, _, _, Some(tau), _) => Err(format!("--tau {tau} is no place in a cycle; give a finite number")),
-        _ => Err("a model of key frames has no signals; give --phase or --tau".into()),
-    }
 }
 
 #[cfg(test)]

@@ -2,8 +2,9 @@
 //!
 //! `cargo run --release -p maille-motion --example fourd_ct -- FOLDER [--sliding] [--stiff] [--stiff-mm 8] [--predict] [--phases 4,8]` with FOLDER/phase01.mha … phase10.mha.
 
-use maille_motion::model::{fit_full_cycle, fit_half_cycle, fit_surrogate};
-use maille_motion::phases::{air_ml, ends, rates, rms_hu};
+use maille_motion::model::{RIDGE, fit_full_cycle, fit_half_cycle, fit_surrogate};
+use maille_motion::phases::{air_ml, ends, rates};
+use maille_motion::quality::rms_hu;
 use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, lung_mask, register};
 use maille_motion::resample::{coarsen, jacobian_determinant};
 use maille_motion::{MotionModel, Precision, Weights};
@@ -127,7 +128,7 @@ fn predict(images: &[ScalarField], fields: &[VectorField]) {
     let full = fit_full_cycle(&of(&odd), &odd.iter().map(|&n| n as f64 / 10.0).collect::<Vec<_>>(), 0.7, 0.3, Precision::I16)
         .expect("five phases");
     let ends = ends(&volume).map(|n| volume[n]);
-    let surrogate = fit_surrogate(&of(&odd), &odd.iter().map(|&n| signal(n)).collect::<Vec<_>>(), ends, Precision::I16)
+    let surrogate = fit_surrogate(&of(&odd), &odd.iter().map(|&n| signal(n)).collect::<Vec<_>>(), ends, RIDGE, Precision::I16)
         .expect("five phases, two signals");
     // the half cycle: odd phases from the fullest lung to the emptiest, placed by the signal
     let (fullest, emptiest) = odd
@@ -148,14 +149,19 @@ fn predict(images: &[ScalarField], fields: &[VectorField]) {
     println!("half cycle on phases {:?}", branch.iter().map(|n| n + 1).collect::<Vec<_>>());
     let mut sums = [0.0; 3];
     for n in (1..10).step_by(2) {
-        let judged = |model: &MotionModel, weights: &Weights| rms(&images[0], &images[n], &predicted(model, weights));
+        let mut folds = Vec::new();
+        let mut judged = |model: &MotionModel, weights: &Weights| {
+            let u = predicted(model, weights);
+            folds.push(jacobian_determinant(&u).values.iter().filter(|d| **d <= 0.0).count());
+            rms(&images[0], &images[n], &u)
+        };
         let f = judged(&full, &full.kind().weights_at(n as f64 / 10.0));
-        let s = judged(&surrogate, &surrogate.kind().weights_of(&signal(n)));
         let h = half.as_ref().map_or(f64::NAN, |half| judged(half, &half.kind().weights_at(place(n))));
+        let s = judged(&surrogate, &surrogate.kind().weights_of(&signal(n)));
         // its own branch lies between the fullest and the emptiest phase, going out
         let own = (n + 10 - fullest) % 10 <= (emptiest + 10 - fullest) % 10;
         println!(
-            "phase {:2}: key frames {f:5.1}, half cycle {h:5.1}{}, surrogate {s:5.1} HU (registered itself {:.1})",
+            "phase {:2}: key frames {f:5.1}, half cycle {h:5.1}{}, surrogate {s:5.1} HU (registered itself {:.1}); cells folded {folds:?}",
             n + 1,
             if own { "" } else { " (other branch)" },
             rms(&images[0], &images[n], &fields[n])

@@ -36,7 +36,7 @@ fn main() {
     let phases: Vec<VectorField> = signals.iter().map(phase).collect();
     let breather = Synthetic::new(&BreathStatistics::default(), 1);
     for precision in [Precision::F32, Precision::F16, Precision::I16] {
-        let model = fit_surrogate(&phases, &signals, [0.0, 1.0], precision).expect("six phases tell two signals apart");
+        let model = fit_surrogate(&phases, &signals, [0.0, 1.0], 0.0, precision).expect("six phases tell two signals apart");
         // a hand that moves a millimetre in a few ticks
         let path: Vec<[f64; 3]> = (0..20_000)
             .map(|n| f64::from(n) * 0.003)

@@ -11,8 +11,10 @@
 
 pub mod breath;
 mod error;
+pub mod landmarks;
 pub mod model;
 pub mod phases;
+pub mod quality;
 pub mod register;
 pub mod resample;
 pub mod signal;

@@ -34,7 +34,7 @@ fn surrogate(precision: Precision) -> MotionModel<'static> {
     let fields = truth(&grid());
     let signals: Vec<Vec<f64>> = (0..8).map(|j| f64::from(j) * 0.785).map(|a| vec![0.5 + 0.5 * a.cos(), -0.4 * a.sin()]).collect();
     let phases: Vec<VectorField> = signals.iter().map(|z| sum(&fields, [z[0] as f32, z[1] as f32])).collect();
-    fit_surrogate(&phases, &signals, [0.0, 1.0], precision).unwrap()
+    fit_surrogate(&phases, &signals, [0.0, 1.0], 0.0, precision).unwrap()
 }
 
 fn points(count: u32) -> impl Iterator<Item = [f64; 3]> {

@@ -1,6 +1,8 @@
 //! A field of another tool (elastix), read as it is: landmarks go where they were found, and the way back is known.
 
+use maille_motion::landmarks::points;
 use maille_motion::model::{fit_full_cycle, fit_half_cycle};
+use maille_motion::quality::landmark_errors;
 use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, lung_mask, register};
 use maille_motion::resample::{coarsen, sample};
 use maille_motion::{MotionAt, Precision};
@@ -115,4 +117,41 @@ fn a_hand_along_the_needles_way_in_a_real_4d_ct_knows_its_place_at_rest_in_every
         // what is told as a bound is one, but for rounding of f32 indices
         assert!(missed <= bound + 1e-4 && missed < 0.02, "{missed} {bound}");
     }
+}
+
+/// The pairs made from DIR-Lab's, as their authors give them, and elastix's own, as the command reads them.
+#[test]
+fn landmark_files_of_others_are_read_as_scipy_and_simpleitk_read_them() {
+    let (Some(dirqa), Some(lung)) = (real_data("landmarks_dirlab_dirqa"), real_data("ct_lung_elastix")) else { return };
+    // voxel sizes of the first case (not in the files)
+    let grid = Grid::axis_aligned([256, 256, 94], [0.97, 0.97, 2.5]);
+    let bytes = std::fs::read(dirqa.join("dense/case1.mat")).unwrap();
+    let of = |variable| points(&bytes, Some(variable), &grid).unwrap();
+    let (ee, ei) = (of("landmark_EE"), of("landmark_EI"));
+    assert_eq!((ee.len(), ei.len()), (1782, 1782));
+    // scipy: the first row of EE is [130, 108, 8.5], which is [y, x, z] from 1
+    let expected = [107.0 * 0.97, 129.0 * 0.97, 7.5 * 2.5];
+    assert!((0..3).all(|c| (ee[0][c] - expected[c]).abs() < 1e-9), "{:?}", ee[0]);
+    let pairs: Vec<[[f64; 3]; 2]> = ee.iter().zip(&ei).map(|(&p, &q)| [p, q]).collect();
+    let still = landmark_errors(&VectorField::zeros(grid.clone()), &pairs);
+    println!("{} pairs, {:.2} mm apart", still.before_mm.count, still.before_mm.mean);
+    assert!(still.before_mm == still.after_mm && still.outside == 0);
+    // the data's own summary: 3.5 mm
+    assert!((still.before_mm.mean - 3.5).abs() < 0.05, "{still:?}");
+    // numbers of one byte, of eight, and a variable that is no list
+    let bytes = std::fs::read(dirqa.join("dirlab300_refined/case1.mat")).unwrap();
+    let first = |variable| points(&bytes, Some(variable), &grid).unwrap()[1];
+    assert_eq!(first("landmark_EE"), [27.0 * 0.97, 131.0 * 0.97, 68.0 * 2.5]);
+    assert!((first("landmark_new_EI")[2] - 71.3 * 2.5).abs() < 1e-9);
+    assert!(points(&bytes, Some("landmark_changed_idx"), &grid).unwrap_err().contains("landmark_dirlab_EI"));
+
+    let read = |name: &str| read_image(&lung.join(name)).unwrap();
+    let field = VectorField::from_image(&read("derived_displacement_baseline_to_followup.mha")).unwrap();
+    let list = |name: &str, of: &str| points(&std::fs::read(lung.join(name)).unwrap(), None, &read(of).grid).unwrap();
+    let before = list("3DCT_lung_baseline.txt", "3DCT_lung_baseline_mask.mha");
+    let after = list("3DCT_lung_followup.txt", "3DCT_lung_followup_mask.mha");
+    let pairs: Vec<[[f64; 3]; 2]> = before.iter().zip(&after).map(|(&p, &q)| [p, q]).collect();
+    let found = landmark_errors(&field, &pairs);
+    assert!((found.before_mm.mean - 34.856).abs() < 1e-3 && (found.after_mm.mean - 2.438).abs() < 1e-3, "{found:?}");
+    assert_eq!(list("3DCT_lung_baseline_landmarks.txt", "3DCT_lung_baseline_mask.mha").len(), 100);
 }

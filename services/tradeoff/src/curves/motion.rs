@@ -11,8 +11,9 @@ use crate::{
 };
 use maille_motion::{
     Breath, Collapsed, MotionAt, MotionModel, Precision, Weights,
-    model::{fit_full_cycle, fit_half_cycle, fit_surrogate},
-    phases::{air_ml, ends, rates, rms_hu},
+    model::{RIDGE, fit_full_cycle, fit_half_cycle, fit_surrogate},
+    phases::{air_ml, ends, rates},
+    quality::rms_hu,
     register::{Anatomy, RegisterOptions, register},
 };
 use maille_testkit::{Displacement, RadialBump, SinusoidalShear, sample_displacement};
@@ -150,7 +151,7 @@ fn surrogate_on(grid: &Grid, precision: Precision) -> Result<MotionModel<'static
     let bases = bases(grid);
     let signals: Vec<Vec<f64>> = (0..6).map(|j| signal(f64::from(j) / 6.0, 1.0).to_vec()).collect();
     let fields: Vec<VectorField> = signals.iter().map(|z| field(&bases, [z[0], z[1], 0.0])).collect();
-    fit_surrogate(&fields, &signals, [0.0, 1.0], precision).map_err(fail)
+    fit_surrogate(&fields, &signals, [0.0, 1.0], 0.0, precision).map_err(fail)
 }
 
 /// Points inside the box, aligned with nothing.
@@ -260,7 +261,7 @@ fn models(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
             // the way out: from the end of inspiration (place 0) to that of expiration, by level
             0 => fit_half_cycle(&fields[..=5], &signals[..=5].iter().map(|z| 1.0 - z[0]).collect::<Vec<_>>(), Precision::I16),
             1 => fit_full_cycle(&fields, &places_in_cycle, 0.0, 0.5, Precision::I16),
-            _ => fit_surrogate(&fields, &signals, [0.0, 1.0], Precision::I16),
+            _ => fit_surrogate(&fields, &signals, [0.0, 1.0], 0.0, Precision::I16),
         }
         .map_err(fail)
     };
@@ -327,7 +328,7 @@ fn four_d_ct(context: &Context) -> Result<Vec<Subject>, TradeoffError> {
     let signals: Vec<Vec<f64>> = odd.iter().map(|&n| signal(n, &volume)).collect();
     let tau: Vec<f64> = odd.iter().map(|&n| n as f64 / 10.0).collect();
     let full = fit_full_cycle(&fields, &tau, 0.7, 0.3, Precision::I16).map_err(fail)?;
-    let surrogate = fit_surrogate(&fields, &signals, ends, Precision::I16).map_err(fail)?;
+    let surrogate = fit_surrogate(&fields, &signals, ends, RIDGE, Precision::I16).map_err(fail)?;
     let edge = reference.grid.spacing[0] * (reference.grid.size[0].min(reference.grid.size[2]) - 1) as f64;
     let mut settings = Vec::new();
     for (word, model) in [("full cycle", full), ("surrogate", surrogate)] {

@@ -6,6 +6,9 @@
 //! the last moments led well. Nodes that a few steps do not settle go on in `Inverter`'s kernels, by damped Newton in the end; those that fail
 //! as well keep their best X and are counted.
 //!
+//! The bound that an update reports needs u to contract everywhere; where organs slide it does not, and [`Collapsed::certified`] says node by node how
+//! far v may be off, at the cost of another evaluation a node.
+//!
 //! Both in index units of the grid, error of storage half a step: (longest u)/32 767/2. Memory: 8 + 8 + 8 bytes a node (u, v, the last v), 8 where only u is asked for.
 //! Whoever wants u or X at few points takes [`super::MotionAt`] instead: it collapses nothing.
 
@@ -24,14 +27,14 @@ use wide::{f32x4, f32x8};
 /// A motion at one moment, at the nodes of its grid.
 #[derive(Clone, Debug)]
 pub struct Collapsed {
-    shape: Shape,
-    size: [usize; 3],
-    spacing: [f32; 3],
-    forward: Vec<[i16; 4]>,
-    forward_scale: f32,
+    pub(super) shape: Shape,
+    pub(super) size: [usize; 3],
+    pub(super) spacing: [f32; 3],
+    pub(super) forward: Vec<[i16; 4]>,
+    pub(super) forward_scale: f32,
     /// v, and the one before
-    inverse: [Vec<[i16; 4]>; 2],
-    inverse_scale: [f32; 2],
+    pub(super) inverse: [Vec<[i16; 4]>; 2],
+    pub(super) inverse_scale: [f32; 2],
     /// moments of v that are known
     known: u8,
     inverter: Inverter,

@@ -22,7 +22,7 @@ pub(super) struct Local {
 
 impl Local {
     /// Of a field in index units at the nodes of a grid, two or more along each axis.
-    pub fn new(nodes: &[[f32; 4]], size: [usize; 3], spacing: [f64; 3]) -> Self {
+    pub fn new(nodes: impl Fn(usize) -> [f32; 3] + Sync, size: [usize; 3], spacing: [f64; 3]) -> Self {
         let cells = size.map(|n| n - 1);
         let [cx, cy, cz] = cells;
         let (row, slice) = (size[0], size[0] * size[1]);
@@ -37,7 +37,7 @@ impl Local {
                     let (a, b) = (steps[(d + 1) % 3], steps[(d + 2) % 3]);
                     let mut most = [0.0f32; 3];
                     for from in [corner, corner + a, corner + b, corner + a + b] {
-                        let (low, high) = (nodes[from], nodes[from + steps[d]]);
+                        let (low, high) = (nodes(from), nodes(from + steps[d]));
                         (0..3).for_each(|c| most[c] = most[c].max((high[c] - low[c]).abs()));
                     }
                     (0..3).for_each(|c| sums[c] += most[c] * stretch[d][c]);
@@ -76,7 +76,7 @@ mod tests {
         // u_x = 0.1·i everywhere; between j = 8 and 9 u_z jumps by a voxel of 4 mm
         let nodes: Vec<[f32; 4]> =
             (0..21 * 18 * 15).map(|n| [0.1 * (n % 21) as f32, 0.0, if n / 21 % 18 <= 8 { 0.0 } else { 1.0 }, 0.0]).collect();
-        let local = Local::new(&nodes, size, spacing);
+        let local = Local::new(|n| [nodes[n][0], nodes[n][1], nodes[n][2]], size, spacing);
         for j in 0..18 {
             let q = local.at([3.0, j as f32 + 0.5, 7.0]);
             // the cell from 8 to 9 lies in the block of cells 8 to 11, and beside that of 4 to 7

@@ -4,6 +4,7 @@
 //! 11–13] differ in their coefficients only ([`Kind`]); everything after them ([`MotionAt`] at a point, [`Collapsed`] as one field) is one code.
 
 mod at;
+mod certified;
 mod collapse;
 mod container;
 mod fit;
@@ -18,8 +19,9 @@ mod steep;
 mod whole;
 
 pub use at::{MotionAt, PointInverse};
+pub use certified::Certified;
 pub use collapse::{CollapseReport, Collapsed};
-pub use fit::{PcaReport, combine, filter, fit_full_cycle, fit_half_cycle, fit_surrogate};
+pub use fit::{Keep, PcaReport, RIDGE, combine, filter, fit_full_cycle, fit_half_cycle, fit_surrogate};
 pub use kind::{Kind, MAX_TERMS, Weights};
 pub use packed::{PackedField, Precision};
 pub use remake::sampled;

@@ -127,7 +127,7 @@ mod tests {
         let field = |scale: f64| sampled(&grid, move |at| [scale * 0.004 * (0.02 * at[0]).sin(), 0.0, -scale * 0.008]);
         let phases: Vec<VectorField> = [2500.0, 2800.0, 3000.0, 3400.0, 3100.0].map(|g| field(g - 3000.0)).into();
         let signals: Vec<Vec<f64>> = [2500.0, 2800.0, 3000.0, 3400.0, 3100.0].map(|g| vec![g, 3.0 * (g * 0.01f64).sin()]).into();
-        let model = crate::model::fit_surrogate(&phases, &signals, [2500.0, 3400.0], Precision::F32).unwrap();
+        let model = crate::model::fit_surrogate(&phases, &signals, [2500.0, 3400.0], 0.0, Precision::F32).unwrap();
         let (remade, error) = model.remade(12.0, Precision::I16).unwrap();
         for breath in usual() {
             let (a, b) = (MotionAt::new(&model, model.weights(&breath)), MotionAt::new(&remade, remade.weights(&breath)));

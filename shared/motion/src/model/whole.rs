@@ -155,7 +155,7 @@ impl<'a> Whole<'a> {
         let largest = size.into_iter().max().unwrap_or(1) as f32;
         let rounding_mm = grid.spacing.iter().fold(0.0f64, |m, s| m.max(*s)) as f32 * f32::EPSILON * (12.0 * longest + largest);
         let inverter = Inverter { scheme: Scheme::Newton, tolerance, contraction: 0.0, weight: [1.0; 3], max_iterations: 60 };
-        let local = (steep >= CONTRACTS).then(|| Local::new(&nodes, size, grid.spacing));
+        let local = (steep >= CONTRACTS).then(|| Local::new(|n| [nodes[n][0], nodes[n][1], nodes[n][2]], size, grid.spacing));
         Ok(Self {
             given,
             shape: Shape::new(grid),
