@@ -175,6 +175,22 @@ fn a_tool_at_rest_on_breathing_skin_feels_the_phase_and_no_step_and_sees_what_it
     assert!(number("/services/deformation/commits") > 0.0, "tissue that breathes gives way");
 }
 
+/// Pictures so large that one takes longer than the supervisor waits before it kills, on most machines.
+#[test]
+fn a_stop_is_heard_in_the_midst_of_a_frame() {
+    let scratch = Scratch::new("breathing-stop");
+    let file = scratch.file("run.json");
+    let large = torso("period_s = 2.5", -125.0).replace("size = [96, 72]\n", "size = [4000, 3000]\nadapt = false\nmode = \"volume\"\n");
+    assert!(large.contains("[4000, 3000]"));
+    let living = Living::start(&scratch, &large, &["--report", file.to_str().unwrap()]);
+    let before = living.now_ns();
+    std::thread::sleep(Duration::from_millis(300));
+    living.end();
+    let said = report(&file);
+    println!("stopped {before} ns into the run: {}", said["services"]["rendering"]);
+    assert_eq!(said["services"]["rendering"]["killed"], false, "{said}");
+}
+
 #[test]
 fn a_scene_that_does_not_breathe_has_nothing_of_it() {
     let scratch = Scratch::new("breathing-none");

@@ -11,6 +11,7 @@
 mod backend;
 mod breath;
 mod compose;
+mod departure;
 #[cfg(test)]
 mod gpu_tests;
 #[cfg(test)]
@@ -70,6 +71,8 @@ const NAP: Duration = Duration::from_millis(10);
 pub fn run(domain: &str) -> Result<(), RenderingError> {
     let domain = Domain::named(domain)?;
     let life = Life::begin(&domain, Role::Rendering)?;
+    // dropped when the loop has ended in order
+    let _departure = departure::Departure::listen(&domain)?;
     let scene = Scene::load(domain.directory().join("scene.toml")).map_err(|e| RenderingError::Scene(e.to_string()))?;
     let reader = Arc::new(Reader::open(&domain, Role::Rendering)?);
     let machine = Machine { cores: std::thread::available_parallelism().map_or(1, usize::from) };
