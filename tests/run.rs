@@ -231,6 +231,20 @@ fn a_device_s_library_that_hangs_where_it_is_opened_is_refused() {
     assert_eq!(left.count(), 0, "nothing is left of it");
 }
 
+/// What only a service can see, once it has the voxels: told once, as a refusal, instead of tried again and again.
+#[test]
+fn a_service_that_refuses_to_start_ends_the_run_with_its_sentence() {
+    let scratch = Scratch::new("run-organ");
+    let organ = "[[organ]]\nname = \"nowhere\"\nhu = [[1.0, 2.0]]\nseed = [0.0, 0.0, 0.0]\n";
+    let output = maille().args(["run", "--headless"]).arg(scratch.write("organ.toml", &format!("{SMALL_SCENE}{organ}"))).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    let last = said.lines().last().unwrap_or_default();
+    assert!(last.starts_with("maille: the service rendering cannot start: the organ `nowhere`"), "{said}");
+    let starts = String::from_utf8_lossy(&output.stdout).matches("rendering    pid").count();
+    assert!((2..=4).contains(&starts), "two starts, two deaths: {}", String::from_utf8_lossy(&output.stdout));
+}
+
 #[test]
 fn wrong_use_ends_with_2_and_what_is_refused_with_1_and_a_sentence() {
     let status = |arguments: &[&str]| {
