@@ -3,6 +3,7 @@
 use crate::HapticError;
 use maille_device::{Kind, Mounting, Options, RemoteDevice, profiles};
 use maille_scene::{Device, RealDevice, Scene, Tool, Waypoints};
+use std::io::Write as _;
 
 /// The real device that a tool asks for.
 pub(crate) fn kind(tool: &Tool) -> Option<Kind> {
@@ -41,7 +42,9 @@ pub(crate) fn open(kind: Kind, mut options: Options, scene: &Scene, way: &Waypoi
     if scene.device.origin_mm.is_none() {
         options.mounting.origin_mm = way.at(0.0).position_mm;
     }
-    Ok(maille_device::open_telling(kind, &options, |sentence| eprintln!("maille-haptic: {sentence}"))?)
+    // a terminal that has gone is no reason to panic
+    let tell = |sentence: &str| drop(writeln!(std::io::stderr(), "maille-haptic: {sentence}"));
+    Ok(maille_device::open_telling(kind, &options, tell)?)
 }
 
 #[cfg(test)]

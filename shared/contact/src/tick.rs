@@ -445,6 +445,8 @@ impl HapticCore {
         let stale = age_s.is_nan() || age_s > self.config.max_pose_age_s;
         self.faults.stale_poses += u64::from(stale);
         if !stale {
+            // by ticks, not by time: what one late tick sees is one reading
+            let dt = dt.min(self.config.period_s);
             self.pose_age_s += (age_s.max(0.0) - self.pose_age_s) * (dt / (dt + POSE_AGE_S));
         }
         let position = finite(pose.position_mm).filter(|p| pose.valid && p.amax() < 1e6);

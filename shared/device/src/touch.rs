@@ -10,7 +10,7 @@ use crate::{
     DeviceError, Options,
     foreign::{Hd, HdFrame, c_string, hd, library},
     link::{Command, Driver, Report},
-    mounting::quaternion,
+    mounting::{is_rotation, quaternion},
 };
 use bytemuck::Zeroable;
 use std::ffi::CString;
@@ -74,8 +74,7 @@ impl Touch {
 
 /// What a device says of itself has a place and a turn: all zeros, or no numbers, are none.
 fn is_pose(t: &[f64; 16]) -> bool {
-    let column = |n: usize| t[4 * n..4 * n + 3].iter().map(|c| c * c).sum::<f64>();
-    t.iter().all(|c| c.is_finite()) && (0..3).all(|n| (column(n) - 1.0).abs() < 0.1)
+    t.iter().all(|c| c.is_finite()) && is_rotation(std::array::from_fn(|row| std::array::from_fn(|n| t[4 * n + row])))
 }
 
 impl Driver for Touch {

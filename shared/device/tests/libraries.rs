@@ -320,7 +320,7 @@ fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back
     let mut core = HapticCore::new(HapticConfig { tissue, ..config });
     let field = |at: [f64; 3]| VolumeSample { value: -100.0 * at[2], gradient: [0.0, 0.0, -100.0] };
     let wall = AnalyticSurface { field, threshold: 0.0, resolution_mm: 1.0 };
-    let (mut period, mut last, mut n) = (Period::new(1000.0), 0.0f64, 0u64);
+    let (mut period, mut last) = (Period::new(1000.0), 0.0f64);
     let mut tick = |device: &mut RemoteDevice, core: &mut HapticCore, steepest: f64| {
         period.wait();
         let out = assert_steady(|| {
@@ -329,9 +329,9 @@ fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back
                 core.set_orientation(q);
             }
             core.set_given(device.gives());
-            n += 1;
             let out = core.tick(&TickInputs {
-                now_ns: n * 1_000_000,
+                // the clock that poses are dated by
+                now_ns: monotonic_ns(),
                 pose,
                 pose_age_s: device.pose_age_s(),
                 tissue: Some(&wall),
@@ -363,7 +363,14 @@ fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back
             break;
         }
     }
-    assert!(resting > 100, "{pressed}");
+    assert!(
+        resting > 100,
+        "{pressed} N, poses {:.2} ms old, {} of {} exchanges late, {} mJ",
+        device.pose_age_s() * 1e3,
+        device.late(),
+        device.exchanges(),
+        core.port_energy_mj()
+    );
     mock.plug(false);
     for _ in 0..600 {
         tick(&mut device, &mut core, 0.1 + 1e-9);
@@ -435,5 +442,48 @@ fn the_second_device_is_not_the_first() {
     assert!(!ticks(&mut second, 0.3, [0.0; 3], |d| d.status() == DeviceStatus::Connected), "there is no second");
     for no_number in ["left", "-1", "1.0", "", "128"] {
         assert!(matches!(usable(Kind::ForceDimension, &named(no_number)), Err(DeviceError::NoNumber { .. })), "{no_number}");
+    }
+}
+
+/// A terminal that is stopped, and one that has gone: whoever would tell something stands still or dies, and the force is led as ever.
+#[test]
+fn who_cannot_tell_a_sentence_keeps_no_force() {
+    for (test, dies) in [("mute", false), ("gone", true)] {
+        let path = built("hd", test);
+        let mock = Mock::of(&path);
+        let tell =
+            move |sentence: &str| if dies { panic!("nobody hears: {sentence}") } else { std::thread::sleep(Duration::from_secs(600)) };
+        let mut device = open_telling(Kind::Touch, &Options { library: Some(path), ..Options::default() }, tell).unwrap();
+        assert!(ticks(&mut device, 5.0, [3.0, 0.0, 0.0], |_| mock.force()[0] == 3.0), "it is found, and given its force");
+        for code in [0x0200, 0x0201, 0x0200, 0x0201] {
+            mock.set("mock_warns", code);
+            ticks(&mut device, 0.05, [3.0, 0.0, 0.0], |_| false);
+        }
+        mock.set("mock_warns", 0);
+        let before = device.exchanges();
+        assert!(ticks(&mut device, 20.0, [3.0, 0.0, 0.0], |d| d.exchanges() > before + 50 && mock.force()[0] > 0.0), "{test}");
+        drop(device);
+        assert_eq!(mock.force(), [0.0; 3], "{test}: let go of");
+    }
+}
+
+/// A frame without an orientation that makes sense is no turn of the tool: the last one stays, and what is no number is not vouched for.
+#[test]
+fn a_frame_without_an_orientation_turns_nothing() {
+    let path = built("dhd", "unturned");
+    let mock = Mock::of(&path);
+    let mut device = open(Kind::ForceDimension, &Options { library: Some(path), ..Options::default() }).unwrap();
+    assert!(ticks(&mut device, 5.0, [0.0; 3], |d| d.status() == DeviceStatus::Connected));
+    let turned = device.orientation().expect("it tells one");
+    // 1: no numbers, 2: zeros, 3: the call fails
+    for kind in [1, 2, 3] {
+        mock.set("mock_unturned", kind);
+        ticks(&mut device, 0.1, [0.0; 3], |_| false);
+        assert_eq!(device.orientation(), Some(turned), "{kind}");
+        assert_eq!(device.read(0).valid, kind == 3, "what is no rotation is not vouched for, what is not told is no fault: {kind}");
+        mock.set("mock_unturned", 0);
+        assert!(ticks(&mut device, 5.0, [0.0; 3], |_| true));
+        ticks(&mut device, 0.1, [0.0; 3], |_| false);
+        assert!(device.read(0).valid && device.orientation() == Some(turned), "and it is back: {kind}");
     }
 }
