@@ -226,6 +226,12 @@ fn a_device_s_library_that_hangs_where_it_is_opened_is_refused() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     // lines are broken where a terminal would end
     assert!(said.replace(|c: char| c.is_whitespace() || c == '│', "").contains("stillbeingopened"), "{said}");
+    // who is asked what hangs must not hang
+    std::fs::copy(&library, scratch.file("libHD.so")).unwrap();
+    let output = maille().arg("doctor").env("LD_LIBRARY_PATH", library.parent().unwrap()).output().unwrap();
+    let told = String::from_utf8_lossy(&output.stdout).into_owned();
+    let line = |subject: &str| told.lines().find(|line| line.contains(subject)).unwrap_or_default().to_owned();
+    assert!(line("touch").contains("still busy") && line("inverse3").contains("no service"), "{told}");
     let processes = std::fs::read_dir("/proc").unwrap().flatten();
     let left = processes.filter(|p| std::fs::read_to_string(p.path().join("cmdline")).is_ok_and(|line| line.contains("libhang.so")));
     assert_eq!(left.count(), 0, "nothing is left of it");

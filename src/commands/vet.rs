@@ -4,7 +4,7 @@
 //! none of that is the supervisor's.
 
 use super::{Failure, Outcome};
-use maille_device::{Kind, Options, usable};
+use maille_device::{Kind, Options, probe::probe_kind, usable};
 use maille_realtime::allowed_cpus;
 use maille_scene::{Device, Scene};
 use rustix::process::{Pid, Signal, kill_process};
@@ -32,13 +32,38 @@ pub struct Args {
     /// Which device
     #[arg(long)]
     id: Option<String>,
+    /// Also ask it what is plugged in, and print that
+    #[arg(long)]
+    probe: bool,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let kind = Kind::named(&args.kind).ok_or_else(|| Failure::Usage(format!("there is no device {}", args.kind)))?;
     let options = Options { library: args.library.clone(), device: args.id.clone(), ..Options::default() };
+    if args.probe {
+        println!("{}", probe_kind(kind, &options).says);
+        return Ok(());
+    }
     usable(kind, &options).map_err(|e| Failure::Refused(e.to_string()))
+}
+
+/// What this machine has of a kind of device, in one sentence.
+pub fn probe(kind: Kind) -> String {
+    let device = kind.name();
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("maille").args(["vet-device", device, "--probe"]);
+    let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
+    match child.and_then(|child| output_within(child, PATIENCE)) {
+        Err(error) => format!("cannot be looked at: {error}"),
+        Ok(None) => format!("its library was still busy after {} s; is a driver of it hanging?", PATIENCE.as_secs()),
+        Ok(Some(done)) => match (done.status.signal(), String::from_utf8_lossy(&done.stdout).lines().last()) {
+            (Some(signal), _) => format!("its library crashes where it is opened (signal {signal})"),
+            // what a vendor's library prints comes before
+            (None, Some(sentence)) => sentence.to_owned(),
+            (None, None) => format!("cannot be looked at ({})", done.status),
+        },
+    }
 }
 
 /// Whether this machine has what a scene names.

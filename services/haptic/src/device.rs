@@ -30,8 +30,8 @@ pub(crate) fn options(scene: &Scene, kind: Option<Kind>) -> Result<Options, Hapt
         library: d.library.clone(),
         device: d.id.clone(),
         mounting: Mounting { rotation: d.rotation.unwrap_or(front.rotation), scale: d.scale.unwrap_or(1.0), ..front },
-        // below the tick, above all else
-        priority: (i32::try_from(scene.haptic.priority.min(99)).unwrap_or(99) - 1).max(0),
+        // below the tick, above all else; of the lowest there is none below
+        priority: i32::try_from(scene.haptic.priority.min(99)).map_or(98, |priority| if priority > 1 { priority - 1 } else { priority }),
         profile: d.profile.as_ref().map(named).transpose()?,
         ..usual
     })

@@ -61,6 +61,8 @@ const CREDIT_MJ: f64 = 10.0;
 const LOWERED_TICKS: usize = 256;
 /// Radius of gyration of device and hand about the handle [mm], at least.
 const GYRATION_MM: f64 = 30.0;
+/// Largest change of the damper's force [N/s].
+const DAMPER_N_PER_S: f64 = 20.0;
 /// How quickly a slower pace is believed [ticks a tick]: a force that it does away with falls by 1/30 of itself a tick, 0.1 N of 3 N.
 const SLOWER: f64 = 1.0 / 30.0;
 /// The same for a quicker one.
@@ -113,6 +115,8 @@ pub struct Passivity {
     ticks: usize,
     reserve_mj: f64,
     max_damping_n_s_per_mm: f64,
+    /// the damper's force [N]
+    damper: V3,
     dissipated_mj: f64,
     lowered: u64,
     /// λ of the last tick
@@ -172,6 +176,7 @@ impl Passivity {
             reserve_mj: hold(reserve_mj, 0.0, 1e3, 0.0),
             // a damper that acts late feeds what it should brake: tolerable are gains far below m / t_d
             max_damping_n_s_per_mm: max_damping_n_s_per_mm.clamp(0.0, 0.3 * port.mass_kg / (port.delay_ticks as f64 + 0.5)),
+            damper: V3::zeros(),
             dissipated_mj: 0.0,
             lowered: 0,
             share: 1.0,
@@ -311,14 +316,16 @@ impl Passivity {
             self.energy_mj -= surplus;
             self.credit_mj = (self.credit_mj - surplus).max(0.0);
         }
-        let mut force = wanted;
         let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
-        if deficit > 0.0 && wanted.norm_squared() > 0.0 {
-            // at most as large as the force itself: touching is no step, and tissue never pulls
-            let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed_mm_s > 0.0 { wanted.norm() / speed_mm_s } else { 0.0 });
-            self.dissipated_mj += alpha * speed_mm_s * speed_mm_s * dt_s;
-            force -= estimate.smooth * alpha;
-        }
+        // at most as large as the force itself: touching is no step, and tissue never pulls
+        let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed_mm_s > 0.0 { wanted.norm() / speed_mm_s } else { 0.0 });
+        // and it comes and goes gently: a balance that is overdrawn in one tick and not in the next is none that a hand should feel
+        let change = -estimate.smooth * alpha - self.damper;
+        let most = DAMPER_N_PER_S * self.port.period_s;
+        self.damper += change * (most / change.norm().max(most));
+        self.damper *= (wanted.norm() / self.damper.norm().max(f64::MIN_POSITIVE)).min(1.0);
+        self.dissipated_mj -= self.damper.dot(&estimate.smooth) * dt_s;
+        let force = wanted + self.damper;
         let ahead = Ahead { estimate, force, torque: wanted_n_mm, last };
         let (pace, part) = (self.pace.floor() as usize, self.pace.fract());
         let between = |pace: usize, part: f64| if part > 0.0 { part * self.foreseen(&ahead, pace) } else { 0.0 };
