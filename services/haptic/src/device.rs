@@ -16,6 +16,7 @@ pub(crate) fn kind(tool: &Tool) -> Option<Kind> {
 }
 
 /// How to find and use it; a kind that is none is a device in another process, which stands as its owner says.
+#[allow(clippy::disallowed_macros)] // before the first tick
 pub(crate) fn options(scene: &Scene, kind: Option<Kind>) -> Result<Options, HapticError> {
     let d = &scene.device;
     let named = |name: &String| {

@@ -125,6 +125,7 @@ struct Dragged {
 impl NeedleStage {
     /// The scene's needle; `None` when the scene has none. Everything that allocates happens here.
     /// `device`: what the device is like, where that is known; `device_torque_n_mm`: the real device's own limit of torque, 0 where it can give none.
+    #[allow(clippy::disallowed_macros)] // before the first tick
     pub fn new(
         domain: &Domain,
         scene: &Scene,

@@ -1,5 +1,7 @@
 //! What goes wrong: bounded output, a count, recovery. And the contract of the tick: no allocation, replay bit by bit.
 
+#![allow(clippy::disallowed_macros)] // a test says what it sees
+
 mod common;
 
 use common::*;

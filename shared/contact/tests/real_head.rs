@@ -1,5 +1,7 @@
 //! A hand slides over a real head, skin and skull: contact kept, no steps, bounded force. Data: `MAILLE_DATA`, else `../shared/data`.
 
+#![allow(clippy::disallowed_macros)] // a test says what it sees
+
 mod common;
 
 use bytemuck::Zeroable;
@@ -17,7 +19,6 @@ fn head() -> Option<BrickedVolume> {
     let path = PathBuf::from(data).join("ct_head_invesalius/cranium_lps.nrrd");
     if !path.exists() {
         assert!(std::env::var_os("CI").is_none(), "{} is missing, and CI requires it", path.display());
-        #[allow(clippy::disallowed_macros)] // a test that did not run says so
         {
             eprintln!("SKIPPED: {} is missing; set MAILLE_DATA", path.display());
         }
@@ -79,7 +80,6 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, shape: ToolShap
         }
         last = Some(f);
     }
-    #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
     {
         println!(
             "{} balls, threshold {threshold}: tick {:?} ns, worst step {:.2} %",

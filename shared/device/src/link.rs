@@ -34,6 +34,8 @@ pub const RETRY: Duration = Duration::from_millis(100);
 const LET_GO: Duration = Duration::from_millis(500);
 /// Sentences that wait for somebody to take them; more are left out.
 const UNHEARD: usize = 32;
+/// Most sentences in a second about whether a device is ready.
+const OFTEN: u32 = 4;
 /// Exchanges without an orientation, from a device that told one, after which that is said.
 const UNTURNED: u32 = 1_000;
 /// Rise of the force after a device came (back) [ns].
@@ -295,8 +297,15 @@ impl<D: Driver> Drop for Opened<'_, D> {
 }
 
 /// What was said last of a device, so that nothing is said twice.
+struct Said {
+    last: Word,
+    /// since when sentences are counted [ns], and how many there were
+    since_ns: u64,
+    count: u32,
+}
+
 #[derive(Clone, Copy, PartialEq)]
-enum Said {
+enum Word {
     Nothing,
     Away,
     NotReady,
@@ -306,30 +315,40 @@ enum Said {
 impl Said {
     /// The device cannot be had. A service that answers without its device is tried ten times a second: said once.
     fn away(&mut self, error: &DeviceError, tell: &dyn Fn(&str)) {
-        if *self != Self::Away {
+        if self.last != Word::Away {
             tell(&format!("{error}; it is looked for ten times a second, and the force is zero meanwhile"));
-            *self = Self::Away;
+            self.last = Word::Away;
         }
     }
 
-    /// The device has spoken.
+    /// The device has spoken. One that changes its mind again and again is heard [`OFTEN`] times a second.
     fn heard(&mut self, ready: bool, name: &str, tell: &dyn Fn(&str)) {
-        match (*self, ready) {
-            (Self::Away, true) => tell(&format!("the device ({name}) is there; its force rises over 0.5 s")),
-            (Self::NotReady, true) => tell(&format!("the device ({name}) is ready")),
-            (Self::Nothing | Self::Away | Self::Ready, false) => {
-                tell(&format!(
-                    "the device ({name}) is there but not ready: home or calibrate it, switch its power on; the force is zero meanwhile"
-                ));
-            }
-            _ => {}
+        let word = if ready { Word::Ready } else { Word::NotReady };
+        if word == self.last {
+            return;
         }
-        *self = if ready { Self::Ready } else { Self::NotReady };
+        let now = monotonic_ns();
+        if now > self.since_ns + 1_000_000_000 {
+            (self.since_ns, self.count) = (now, 0);
+        }
+        self.count += 1;
+        if self.count > OFTEN {
+            return;
+        }
+        match (self.last, ready) {
+            (Word::Away, true) => tell(&format!("the device ({name}) is there; its force rises over 0.5 s")),
+            (Word::NotReady, true) => tell(&format!("the device ({name}) is ready")),
+            (_, false) => tell(&format!(
+                "the device ({name}) is there but not ready: home or calibrate it, switch its power on; the force is zero meanwhile"
+            )),
+            (Word::Nothing | Word::Ready, true) => {}
+        }
+        self.last = word;
     }
 }
 
 fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell: &dyn Fn(&str)) {
-    let (mut said, mut warned) = (Said::Nothing, Vec::new());
+    let (mut said, mut warned) = (Said { last: Word::Nothing, since_ns: 0, count: 0 }, Vec::new());
     let (mut turned, mut unturned) = (false, 0);
     while !shared.stop.load(Relaxed) {
         if let Err(error) = driver.open() {

@@ -487,3 +487,28 @@ fn a_frame_without_an_orientation_turns_nothing() {
         assert!(device.read(0).valid && device.orientation() == Some(turned), "and it is back: {kind}");
     }
 }
+
+/// Some frames of libHD without a place: not vouched for, and nothing else; a tenth of a second of them is a device that has gone.
+#[test]
+fn a_touch_that_loses_its_place_for_some_frames_is_kept() {
+    let path = built("hd", "unplaced");
+    let mock = Mock::of(&path);
+    let mut device = open(Kind::Touch, &Options { library: Some(path), ..Options::default() }).unwrap();
+    assert!(ticks(&mut device, 5.0, [1.0, 0.0, 0.0], |_| mock.force()[0] == 1.0));
+    let place = device.read(0).position_mm;
+    mock.set("mock_unplaced", 20);
+    let mut doubted = 0;
+    let mut period = Period::new(1000.0);
+    for _ in 0..200 {
+        period.wait();
+        let pose = device.read(monotonic_ns());
+        doubted += u32::from(!pose.valid);
+        assert_eq!(pose.position_mm, place, "the last place stays");
+        device.write([1.0, 0.0, 0.0]);
+    }
+    assert!(doubted > 0, "a frame without a place is not vouched for");
+    let pose = device.read(0);
+    assert!(pose.valid && pose.position_mm == place && device.opened() == 1, "{pose:?}, opened {} times", device.opened());
+    mock.set("mock_unplaced", 400);
+    assert!(ticks(&mut device, 10.0, [1.0, 0.0, 0.0], |d| d.opened() > 1), "a device that has no place for long is opened anew");
+}
