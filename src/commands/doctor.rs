@@ -1,7 +1,7 @@
 //! `maille doctor`.
 
-use super::{Failure, Outcome};
-use maille_device::Options;
+use super::{Failure, Outcome, vet};
+use maille_device::Kind;
 use maille_supervisor::doctor::{Verdict, examine};
 use serde_json::json;
 
@@ -20,9 +20,7 @@ pub fn run(args: &Args) -> Outcome {
     let mut rows: Vec<(String, Verdict, String, String)> =
         examine().into_iter().map(|f| (f.subject.into(), f.verdict, f.found, f.advice)).collect();
     // no device is no fault: a simulated hand stands in
-    rows.extend(
-        maille_device::probe(&Options::default()).into_iter().map(|f| (f.kind.name().into(), Verdict::Good, f.says, String::new())),
-    );
+    rows.extend(Kind::ALL.map(|kind| (kind.name().into(), Verdict::Good, vet::probe(kind), String::new())));
     if args.json {
         let word = |verdict| match verdict {
             Verdict::Good => "good",

@@ -3,6 +3,7 @@
 use crate::HapticError;
 use maille_device::{Kind, Mounting, Options, RemoteDevice, profiles};
 use maille_scene::{Device, RealDevice, Scene, Tool, Waypoints};
+use std::io::Write as _;
 
 /// The real device that a tool asks for.
 pub(crate) fn kind(tool: &Tool) -> Option<Kind> {
@@ -15,6 +16,7 @@ pub(crate) fn kind(tool: &Tool) -> Option<Kind> {
 }
 
 /// How to find and use it; a kind that is none is a device in another process, which stands as its owner says.
+#[allow(clippy::disallowed_macros)] // before the first tick
 pub(crate) fn options(scene: &Scene, kind: Option<Kind>) -> Result<Options, HapticError> {
     let d = &scene.device;
     let named = |name: &String| {
@@ -29,8 +31,8 @@ pub(crate) fn options(scene: &Scene, kind: Option<Kind>) -> Result<Options, Hapt
         library: d.library.clone(),
         device: d.id.clone(),
         mounting: Mounting { rotation: d.rotation.unwrap_or(front.rotation), scale: d.scale.unwrap_or(1.0), ..front },
-        // below the tick, above all else
-        priority: (i32::try_from(scene.haptic.priority.min(99)).unwrap_or(99) - 1).max(0),
+        // below the tick, above all else; of the lowest there is none below
+        priority: i32::try_from(scene.haptic.priority.min(99)).map_or(98, |priority| if priority > 1 { priority - 1 } else { priority }),
         profile: d.profile.as_ref().map(named).transpose()?,
         ..usual
     })
@@ -41,7 +43,9 @@ pub(crate) fn open(kind: Kind, mut options: Options, scene: &Scene, way: &Waypoi
     if scene.device.origin_mm.is_none() {
         options.mounting.origin_mm = way.at(0.0).position_mm;
     }
-    Ok(maille_device::open_telling(kind, &options, |sentence| eprintln!("maille-haptic: {sentence}"))?)
+    // a terminal that has gone is no reason to panic
+    let tell = |sentence: &str| drop(writeln!(std::io::stderr(), "maille-haptic: {sentence}"));
+    Ok(maille_device::open_telling(kind, &options, tell)?)
 }
 
 #[cfg(test)]

@@ -37,6 +37,7 @@ pub(crate) struct SmoothStage {
 
 impl SmoothStage {
     /// What the scene asks for; `None`: the interpolated field alone is felt.
+    #[allow(clippy::disallowed_macros)] // before the first tick
     pub fn new(scene: &Scene, source: &impl BrickSource, radius_mm: f64) -> Result<Option<Self>, HapticError> {
         let surface = scene.touched_surface();
         if surface == TouchedSurface::Interpolated {

@@ -54,6 +54,7 @@ pub(crate) struct Loop<'a, W> {
 
 impl<'a, W: Stopwatch> Loop<'a, W> {
     /// Sets the loop up; everything that allocates happens here.
+    #[allow(clippy::disallowed_macros)] // before the first tick
     pub fn new(
         domain: &Domain,
         scene: &Scene,

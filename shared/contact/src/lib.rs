@@ -18,6 +18,7 @@
 //! with the passivity controller on, when less is stored than the slower fall would give out.)
 
 #![forbid(unsafe_code)]
+#![cfg_attr(test, allow(clippy::disallowed_macros))] // tests say what they see
 
 pub mod coupling;
 mod cubic;

@@ -29,7 +29,8 @@
 //!
 //! **Slow devices.** A device that is read and given its command every h ticks holds that command for h: a new reading's way is paired with the command
 //! that stood when the reading before it was taken, readings that are seen again say nothing, and what is foreseen is h ticks long
-//! ([`Passivity::seen`]).
+//! ([`Passivity::seen`]). A pace that changes while a force is given is believed little by little: what is foreseen of a device that answers late for some exchanges must not let go
+//! of a tip that rests, and what it really gives out meanwhile is seen in the balance.
 //!
 //! **Torque** does its work on the turns, paired and foreseen alike (with an inertia of that mass at [`GYRATION_MM`] from the handle), and is lowered
 //! by the same λ: one balance for both.
@@ -60,6 +61,12 @@ const CREDIT_MJ: f64 = 10.0;
 const LOWERED_TICKS: usize = 256;
 /// Radius of gyration of device and hand about the handle [mm], at least.
 const GYRATION_MM: f64 = 30.0;
+/// Largest change of the damper's force [N/s].
+const DAMPER_N_PER_S: f64 = 20.0;
+/// How quickly a slower pace is believed [ticks a tick]: a force that it does away with falls by 1/30 of itself a tick, 0.1 N of 3 N.
+const SLOWER: f64 = 1.0 / 30.0;
+/// The same for a quicker one.
+const QUICKER: f64 = 0.1;
 /// Time in which a lowered force comes back [s].
 const SHARE_S: f64 = 0.02;
 
@@ -108,6 +115,8 @@ pub struct Passivity {
     ticks: usize,
     reserve_mj: f64,
     max_damping_n_s_per_mm: f64,
+    /// the damper's force [N]
+    damper: V3,
     dissipated_mj: f64,
     lowered: u64,
     /// λ of the last tick
@@ -129,6 +138,8 @@ pub struct Passivity {
     unread: usize,
     /// ticks between the last new readings
     paces: [usize; 3],
+    /// ticks from one reading to the next, as far as that is believed
+    pace: f64,
     /// the reading is a new one
     fresh: bool,
 }
@@ -165,6 +176,7 @@ impl Passivity {
             reserve_mj: hold(reserve_mj, 0.0, 1e3, 0.0),
             // a damper that acts late feeds what it should brake: tolerable are gains far below m / t_d
             max_damping_n_s_per_mm: max_damping_n_s_per_mm.clamp(0.0, 0.3 * port.mass_kg / (port.delay_ticks as f64 + 0.5)),
+            damper: V3::zeros(),
             dissipated_mj: 0.0,
             lowered: 0,
             share: 1.0,
@@ -178,6 +190,7 @@ impl Passivity {
             unread_s: port.period_s,
             unread: 1,
             paces: [1; 3],
+            pace: 1.0,
             fresh: true,
         }
     }
@@ -238,12 +251,12 @@ impl Passivity {
         if self.fresh && self.unread < MAX_DELAY {
             self.paces = [self.paces[1], self.paces[2], self.unread];
         }
-    }
-
-    /// Ticks from one reading to the next: the median of three, as one late exchange is no slow device.
-    fn pace(&self) -> usize {
+        // the median of three, as one late exchange is no slow device
         let [a, b, c] = self.paces;
-        a.max(b).min(a.min(b).max(c)).min(MAX_DELAY)
+        let seen = a.max(b).min(a.min(b).max(c)).clamp(1, MAX_DELAY) as f64;
+        // while nothing is given there is nothing to let go of
+        let given = self.force_ago(0) != V3::zeros() || self.given_n_mm[self.ago(0)] != V3::zeros();
+        self.pace = if given { self.pace + (seen - self.pace).clamp(-QUICKER, SLOWER) } else { seen };
     }
 
     /// How many ticks ago the command was given that stood over the way that a new reading ends.
@@ -278,9 +291,7 @@ impl Passivity {
     /// `elastic_mj`. `wanted_n_mm` is to be lowered by [`share`](Self::share).
     pub(crate) fn control(&mut self, position: V3, wanted: V3, wanted_n_mm: V3, elastic_mj: f64, dt_s: f64) -> V3 {
         let per_mass = 1000.0 / self.port.mass_kg;
-        let pace = self.pace();
-        let delay = (self.port.delay_ticks + pace - 1).min(MAX_DELAY);
-        let last = self.force_ago(delay);
+        let last = self.force_ago(self.pending(self.pace.ceil() as usize));
         // what lies ahead is a tick as planned: a late one is no reason to fear that the next will be as late, and to let go for that
         let ahead_s = self.port.period_s;
         if self.fresh {
@@ -305,11 +316,41 @@ impl Passivity {
             self.energy_mj -= surplus;
             self.credit_mj = (self.credit_mj - surplus).max(0.0);
         }
+        let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
+        // at most as large as the force itself: touching is no step, and tissue never pulls
+        let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed_mm_s > 0.0 { wanted.norm() / speed_mm_s } else { 0.0 });
+        // and it comes and goes gently: a balance that is overdrawn in one tick and not in the next is none that a hand should feel
+        let change = -estimate.smooth * alpha - self.damper;
+        let most = DAMPER_N_PER_S * self.port.period_s;
+        self.damper += change * (most / change.norm().max(most));
+        self.damper *= (wanted.norm() / self.damper.norm().max(f64::MIN_POSITIVE)).min(1.0);
+        self.dissipated_mj -= self.damper.dot(&estimate.smooth) * dt_s;
+        let force = wanted + self.damper;
+        let ahead = Ahead { estimate, force, torque: wanted_n_mm, last };
+        let (pace, part) = (self.pace.floor() as usize, self.pace.fract());
+        let between = |pace: usize, part: f64| if part > 0.0 { part * self.foreseen(&ahead, pace) } else { 0.0 };
+        let share = ceiling * (between(pace, 1.0 - part) + between(pace + 1, part));
+        // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
+        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + self.port.period_s / SHARE_S } else { 1.0 });
+        self.lowered += u64::from(self.share < 1.0);
+        self.since_lowered = if self.share < 1.0 { 0 } else { self.since_lowered.saturating_add(1) };
+        if ceiling > 0.0 { force * (self.share / ceiling) } else { V3::zeros() }
+    }
+
+    /// Ticks whose forces may have acted since the position that is seen.
+    fn pending(&self, pace: usize) -> usize {
+        (self.port.delay_ticks + pace - 1).min(MAX_DELAY)
+    }
+
+    /// The largest λ for which what is foreseen of a device of a pace [ticks] does not exceed what is stored.
+    fn foreseen(&self, ahead: &Ahead, pace: usize) -> f64 {
+        let Ahead { estimate, force, torque: wanted_n_mm, last } = ahead;
+        let (per_mass, ahead_s) = (1000.0 / self.port.mass_kg, self.port.period_s);
         // what the pending forces may have given out since the position that is seen
-        let mut stored = self.certain_mj() + ADVANCE_MJ - 0.5 * self.port.quantum_mm * one_norm(&last);
+        let mut stored = self.certain_mj() + ADVANCE_MJ - 0.5 * self.port.quantum_mm * one_norm(last);
         let (mut velocity, mut slack) = (estimate.velocity, SLACK * estimate.error);
         let (mut spin, per_inertia) = (self.spin, per_mass / (GYRATION_MM * GYRATION_MM));
-        for ago in (0..delay).rev() {
+        for ago in (0..self.pending(pace)).rev() {
             let torque = self.given_n_mm[self.ago(ago)];
             let spun = torque * (per_inertia * ahead_s);
             stored -= torque.dot(&(spin + spun * 0.5)) * ahead_s;
@@ -323,22 +364,9 @@ impl Passivity {
         // the command stands until the next exchange
         let ahead_s = ahead_s * pace as f64;
         slack += SLACK * self.port.hand_mm_s2 * ahead_s;
-        let mut force = wanted;
-        let deficit = (-2.0 * self.certain_mj() / ADVANCE_MJ).clamp(0.0, 1.0);
-        if deficit > 0.0 && wanted.norm_squared() > 0.0 {
-            // at most as large as the force itself: touching is no step, and tissue never pulls
-            let alpha = (deficit * self.max_damping_n_s_per_mm).min(if speed_mm_s > 0.0 { wanted.norm() / speed_mm_s } else { 0.0 });
-            self.dissipated_mj += alpha * speed_mm_s * speed_mm_s * dt_s;
-            force -= estimate.smooth * alpha;
-        }
         let out = (force.dot(&velocity) + force.norm() * slack + wanted_n_mm.dot(&spin)) * ahead_s;
         let quickening = 0.5 * (per_mass * force.norm_squared() + per_inertia * wanted_n_mm.norm_squared()) * ahead_s * ahead_s;
-        let share = ceiling * largest_share(quickening, out, stored.max(0.0));
-        // a force once lowered comes back slowly: one that flickers between both would lose each flicker's rounding
-        self.share = share.min(if wanted.norm_squared() > 0.0 { self.share + self.port.period_s / SHARE_S } else { 1.0 });
-        self.lowered += u64::from(self.share < 1.0);
-        self.since_lowered = if self.share < 1.0 { 0 } else { self.since_lowered.saturating_add(1) };
-        if ceiling > 0.0 { force * (self.share / ceiling) } else { V3::zeros() }
+        largest_share(quickening, out, stored.max(0.0))
     }
 
     /// Takes the position into the estimate of the velocity, whose windows are of ticks as planned: the ticks missed before a late one are
@@ -406,6 +434,16 @@ impl Passivity {
         self.given_n_mm[at] = torque_n_mm;
         self.ticks += 1;
     }
+}
+
+/// What the next force is foreseen from.
+struct Ahead {
+    estimate: Estimate,
+    /// to be given [N], [N·mm]
+    force: V3,
+    torque: V3,
+    /// that stood when the position that is seen was taken
+    last: V3,
 }
 
 fn one_norm(v: &V3) -> f64 {

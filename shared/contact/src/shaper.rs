@@ -3,8 +3,8 @@
 //! F = slew( g(t) · clamp(F_wanted, F_max) ), with the gain g rising from 0 to 1 over `ramp_s` and falling to 0 over `fade_s` while
 //! an input is stale or the end was asked for.
 //!
-//! On leaving ([`ForceShaper::leave`]) the fade takes [`LEAVE_FADE_S`] at most, and the slew limit is raised to what a hand is promised anyway, 0.1 N a
-//! tick: a scene whose fade is long, or whose slew limit is low, still has no force when the process is gone.
+//! On leaving ([`ForceShaper::leave`]) the fade takes [`LEAVE_FADE_S`] at most, and the slew limit is what a hand is promised, 0.1 N a tick: a
+//! scene whose fade is long, or whose slew limit is low, still has no force when the process is gone, and one without either does not let go in a step.
 //!
 //! Invariants, whatever comes in (NaN, infinite, any dt): |F| ≤ F_max, |F − F_last| ≤ slew · dt, F finite. A wanted force
 //! that is not finite counts as zero and as stale. Units: N, s. Cost: constant. Allocation: none.
@@ -13,7 +13,7 @@ use crate::{V3, finite, limits::MAX_STEP_S};
 
 /// Longest fade on leaving [s].
 pub const LEAVE_FADE_S: f64 = 0.25;
-/// Slew limit on leaving, where the declared one is lower [N/s]: 0.1 N a tick at 1 kHz.
+/// Slew limit on leaving [N/s]: 0.1 N a tick at 1 kHz.
 pub const LEAVE_SLEW_N_PER_S: f64 = 100.0;
 
 /// What a device may be asked for.
@@ -72,15 +72,20 @@ impl ForceShaper {
         self.last.into()
     }
 
-    /// From here on fades end in time: whoever gives the force is about to go. `slew_n_per_s` holds in place of a lower limit.
+    /// From here on fades end in time: whoever gives the force is about to go. `slew_n_per_s` holds in place of the limit.
     pub fn leave(&mut self, slew_n_per_s: f64) {
         self.limits.fade_s = self.limits.fade_s.min(LEAVE_FADE_S);
-        self.limits.max_slew_n_per_s = self.limits.max_slew_n_per_s.max(slew_n_per_s);
+        self.limits.max_slew_n_per_s = slew_n_per_s;
     }
 
     /// Tells that a force smaller than the last shaped one was given: what was cut for passivity is not to be risen from.
     pub(crate) fn cut_to(&mut self, force: V3) {
         self.last = clamp_norm(force, self.limits.max_force_n);
+    }
+
+    /// A force held to the largest there may be [N].
+    pub(crate) fn held(&self, force: V3) -> [f64; 3] {
+        clamp_norm(force, self.limits.max_force_n).into()
     }
 
     /// The force to give [N] when `wanted_n` is wanted, `dt_s` after the last call; `fading` while it shall go to zero.

@@ -411,9 +411,11 @@ impl HapticCore {
             }
             let torque = V3::from(out.torque_n_mm) * in_hand;
             let force = self.passivity.control(port, V3::from(out.force_n), torque, self.elastic_mj * in_hand, dt);
-            self.shaper.cut_to(force);
-            self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * self.passivity.share());
-            (out.force_n, out.torque_n_mm) = (self.shaper.last_n(), self.torque_shaper.last_n());
+            // of what is given the damper's part is no part of what the limits go on from: it would be taken off again from what is left
+            let share = self.passivity.share();
+            self.shaper.cut_to(V3::from(out.force_n) * share);
+            self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * share);
+            (out.force_n, out.torque_n_mm) = (self.shaper.held(force), self.torque_shaper.last_n());
         }
         let torque = V3::from(out.torque_n_mm) / self.config.patient_mm_per_hand_mm;
         self.passivity.given(V3::from(out.force_n) * self.gives, torque * self.gives);
@@ -445,6 +447,8 @@ impl HapticCore {
         let stale = age_s.is_nan() || age_s > self.config.max_pose_age_s;
         self.faults.stale_poses += u64::from(stale);
         if !stale {
+            // by ticks, not by time: what one late tick sees is one reading
+            let dt = dt.min(self.config.period_s);
             self.pose_age_s += (age_s.max(0.0) - self.pose_age_s) * (dt / (dt + POSE_AGE_S));
         }
         let position = finite(pose.position_mm).filter(|p| pose.valid && p.amax() < 1e6);

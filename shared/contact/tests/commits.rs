@@ -4,7 +4,7 @@ mod common;
 
 use common::*;
 use maille_contact::{
-    AnalyticSurface, Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, Material, SimulatedHand, Surface, TickInputs,
+    AnalyticSurface, Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, Limits, Material, SimulatedHand, Surface, TickInputs,
     TissueTable,
 };
 use maille_volume::VolumeSample;
@@ -220,6 +220,9 @@ fn pumped(
         let out = d.tick(&wall(height), epoch, V3::new(0.0, 0.0, z));
         if let Some((last_z, force)) = last {
             out_mj += force * (z - last_z);
+            // by the slew limit, and by the damper's own: a force that is lowered is not wound up tick by tick
+            let rise = out.force_n[2].abs() - force.abs();
+            assert!(rise <= config.limits.max_slew_n_per_s * 1e-3 + 0.02 + 1e-9, "the force rises by {rise} N in tick {n}");
         }
         most = most.max(out_mj);
         held = held.max(-out_mj);
@@ -251,15 +254,20 @@ fn with_the_controller_on_no_sequence_of_commits_feeds_the_hand_for_long() {
     let mut pumped_most = 0.0f64;
     for n in 0..8 {
         let run = |passivity, random: &mut _| {
-            pumped(HapticConfig { passivity, ..plain(2.0, SPRING) }, 30_000, random, |height, depth, _, _, r| {
-                if n % 2 == 0 {
-                    -4.0 + 5.0 * r
-                } else if depth > 0.2 {
-                    height + 1.0
-                } else {
-                    height - 1.0
-                }
-            })
+            pumped(
+                HapticConfig { passivity, limits: Limits { ramp_s: 0.01, ..Limits::default() }, ..plain(2.0, SPRING) },
+                30_000,
+                random,
+                |height, depth, _, _, r| {
+                    if n % 2 == 0 {
+                        -4.0 + 5.0 * r
+                    } else if depth > 0.2 {
+                        height + 1.0
+                    } else {
+                        height - 1.0
+                    }
+                },
+            )
         };
         let (on, off) = (run(true, &mut random).0, run(false, &mut random).0);
         pumped_most = pumped_most.max(off);

@@ -1,5 +1,7 @@
 //! What goes wrong: bounded output, a count, recovery. And the contract of the tick: no allocation, replay bit by bit.
 
+#![allow(clippy::disallowed_macros)] // a test says what it sees
+
 mod common;
 
 use common::*;
@@ -378,7 +380,9 @@ fn tools_of_several_balls_are_bounded_whatever_comes() {
 fn on_leaving_the_force_is_gone_in_time_whatever_the_fade_and_the_slew_limit() {
     let volume = ball();
     let tissue = Isosurface::new(&volume, 0.0);
-    for (fade_s, max_slew_n_per_s, passivity) in [(10.0, 1.0, false), (10.0, 100.0, true), (0.1, 1.0, true), (0.05, 400.0, false)] {
+    for (fade_s, max_slew_n_per_s, passivity) in
+        [(10.0, 1.0, false), (10.0, 100.0, true), (0.1, 1.0, true), (0.05, 400.0, false), (0.0, 1e5, true)]
+    {
         let limits = maille_contact::Limits { max_force_n: MAX_FORCE_N, max_slew_n_per_s, ramp_s: 0.5, fade_s };
         let mut core = HapticCore::new(HapticConfig { limits, passivity, ..config() });
         let mut tick = |n: u64, release: bool| {
@@ -400,7 +404,7 @@ fn on_leaving_the_force_is_gone_in_time_whatever_the_fade_and_the_slew_limit() {
         let mut gone = None;
         for n in 0..800 {
             let force = tick(3000 + n, true);
-            assert!((force - last).norm() <= MAX_STEP_N.max(max_slew_n_per_s * 1e-3) + 1e-9, "{last:?} {force:?}");
+            assert!((force - last).norm() <= MAX_STEP_N + 1e-9, "{last:?} {force:?}");
             last = force;
             gone = gone.or((force == V3::zeros()).then_some(n));
         }

@@ -1,10 +1,14 @@
 //! A hand slides over a real head, skin and skull: contact kept, no steps, bounded force. Data: `MAILLE_DATA`, else `../shared/data`.
 
+#![allow(clippy::disallowed_macros)] // a test says what it sees
+
 mod common;
 
 use bytemuck::Zeroable;
 use common::*;
-use maille_contact::{Coupling, Device, Grip, HapticConfig, HapticCore, Isosurface, SimulatedHand, Surface, TickInputs, ToolShape};
+use maille_contact::{
+    Coupling, Device, DevicePose, DeviceProfile, Grip, HapticConfig, HapticCore, Isosurface, SimulatedHand, Surface, TickInputs, ToolShape,
+};
 use maille_contract::histogram::SharedHistogram;
 use maille_realtime::monotonic_ns;
 use maille_volume::{BrickSource, BrickedVolume, io::read_volume};
@@ -15,7 +19,6 @@ fn head() -> Option<BrickedVolume> {
     let path = PathBuf::from(data).join("ct_head_invesalius/cranium_lps.nrrd");
     if !path.exists() {
         assert!(std::env::var_os("CI").is_none(), "{} is missing, and CI requires it", path.display());
-        #[allow(clippy::disallowed_macros)] // a test that did not run says so
         {
             eprintln!("SKIPPED: {} is missing; set MAILLE_DATA", path.display());
         }
@@ -77,7 +80,6 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, shape: ToolShap
         }
         last = Some(f);
     }
-    #[allow(clippy::disallowed_macros)] // a figure for whoever runs the test
     {
         println!(
             "{} balls, threshold {threshold}: tick {:?} ns, worst step {:.2} %",
@@ -99,6 +101,78 @@ fn sliding_over_skin_and_skull_keeps_contact_and_gives_no_step() {
         let (worst, touched) = slide(&volume, threshold, elevation, ToolShape::sphere(3.0), grip);
         assert!(touched > 0.9, "threshold {threshold}: {:.0} % of ticks in contact", touched * 100.0);
         assert!(worst <= 0.05, "threshold {threshold}: worst step {:.1} %", worst * 100.0);
+    }
+}
+
+/// A stiff desktop device with a delay of its own: the passivity controller at work.
+const DEVICE: DeviceProfile = DeviceProfile {
+    name: "test",
+    max_force_n: 12.0,
+    max_torque_n_mm: 0.0,
+    max_stiffness_n_per_mm: 5.0,
+    damping_n_s_per_mm: 0.03,
+    coulomb_n: 0.1,
+    quantum_mm: 0.01,
+    mass_kg: 0.1,
+    delay_s: 0.002,
+    workspace_mm: 75.0,
+};
+
+/// Largest step in parts of max(force, 0.5 N), and the part of ticks in contact: a tip that nothing holds back is led along a straight line of 12 mm
+/// to and fro at a speed, `depth_mm` below where the surface is in its middle.
+fn led(volume: &BrickedVolume, threshold: f64, elevation: f64, along: V3, speed_mm_s: f64, depth_mm: f64) -> (f64, f64) {
+    let tissue = Isosurface::new(volume, threshold);
+    let center = V3::from(volume.info().grid.center());
+    let inward = -V3::new(-0.2, -1.0, elevation).normalize();
+    let along = (along - inward * along.dot(&inward)).normalize();
+    let mut r = 140.0;
+    while r > 20.0 && !tissue.value((center - inward * r).into()).is_some_and(|v| v >= threshold) {
+        r -= 0.5;
+    }
+    let (config, _) = HapticConfig::on_device(3.0, 2.0, 5e-4, 1e-3, &DEVICE).unwrap();
+    let mut core = HapticCore::new(config);
+    let (mut worst, mut touched, mut last) = (0.0f64, 0, None::<V3>);
+    for n in 0..6_000u64 {
+        let t = n as f64 * 1e-3;
+        let lift = 3.0 + 3.0 - (depth_mm + 3.0) * (t / 1.0).min(1.0);
+        let round = 24.0 / speed_mm_s;
+        let phase = ((t - 1.5).max(0.0) % round) / round;
+        let way = 12.0 * (1.0 - (2.0 * phase - 1.0).abs()) - 6.0;
+        let at = center - inward * (r + lift) + along * (way + 6.0);
+        let pose = DevicePose { direction: inward.into(), ..pose(at) };
+        let out = core.tick(&TickInputs {
+            now_ns: n * 1_000_000,
+            pose,
+            pose_age_s: 0.0,
+            tissue: Some(&tissue),
+            epoch: 0,
+            tissue_age_s: 0.0,
+            release: false,
+        });
+        let f = V3::from(out.force_n);
+        if n >= 1_500 {
+            if let Some(last) = last {
+                worst = worst.max((f - last).norm() / f.norm().max(0.5));
+            }
+            touched += u32::from(out.in_contact);
+        }
+        last = Some(f);
+    }
+    (worst, f64::from(touched) / 4_500.0)
+}
+
+#[test]
+fn a_tip_that_is_led_over_skin_and_skull_by_a_device_of_its_own_delay_feels_no_step() {
+    let Some(volume) = head() else { return };
+    for (threshold, elevation) in [(-300.0, 0.35), (276.0, 1.2)] {
+        for along in [V3::x(), V3::z()] {
+            for (speed, depth) in [(50.0, 3.0), (50.0, 4.0), (100.0, 3.0)] {
+                let (worst, touched) = led(&volume, threshold, elevation, along, speed, depth);
+                let what =
+                    format!("threshold {threshold}, along {along:?}, {speed} mm/s, {depth} mm deep: {:.1} % at worst", worst * 100.0);
+                assert!(touched > 0.95 && worst <= 0.05, "{what}, {:.0} % of ticks in contact", touched * 100.0);
+            }
+        }
     }
 }
 

@@ -2,6 +2,8 @@
 //!
 //! Rests last 20 s; with `MAILLE_REST_S=120` as many seconds as it says.
 
+#![allow(clippy::disallowed_macros)] // a test says what it sees
+
 mod common;
 
 use common::*;
@@ -183,7 +185,6 @@ fn cases(times: &[f64]) -> Vec<Case> {
     cases
 }
 
-#[allow(clippy::disallowed_macros)] // figures for whoever runs the test
 fn say(line: String) {
     println!("{line}");
 }

@@ -17,6 +17,7 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
+        mpsc::sync_channel,
     },
     thread::{self, JoinHandle},
     time::{Duration, Instant},
@@ -31,6 +32,12 @@ pub const RETRY: Duration = Duration::from_millis(100);
 /// Longest wait for the thread of a device that is let go: two exchanges of the slowest kind. A library or a name server that hangs does not keep the
 /// process, whose end closes what is open.
 const LET_GO: Duration = Duration::from_millis(500);
+/// Sentences that wait for somebody to take them; more are left out.
+const UNHEARD: usize = 32;
+/// Most sentences in a second about whether a device is ready.
+const OFTEN: u32 = 4;
+/// Exchanges without an orientation, from a device that told one, after which that is said.
+const UNTURNED: u32 = 1_000;
 /// Rise of the force after a device came (back) [ns].
 pub const RISE_NS: u64 = 500_000_000;
 
@@ -42,7 +49,7 @@ pub struct Report {
     pub position_mm: [f64; 3],
     /// of the tip [mm/s]
     pub velocity_mm_s: [f64; 3],
-    /// of the tool (x, y, z, w); zero where the device knows none
+    /// of the tool (x, y, z, w); zero where the device tells none, no numbers where what it tells is none
     pub orientation: [f64; 4],
     /// one bit each
     pub buttons: u64,
@@ -54,6 +61,17 @@ pub struct Report {
     pub taken_ns: u64,
     /// what the device warns of, in its maker's code; 0: nothing
     pub warning: u64,
+}
+
+impl Report {
+    /// Whether it says how the tool is turned.
+    fn is_turned(&self) -> bool {
+        self.orientation.iter().map(|c| c * c).sum::<f64>() > 1e-6
+    }
+}
+
+fn finite(values: &[f64]) -> bool {
+    values.iter().all(|v| v.is_finite())
 }
 
 /// What a device shall do, in its own frame.
@@ -126,7 +144,8 @@ impl RemoteDevice {
     }
 
     /// The same with SCHED_FIFO of `priority` for the thread (0: none), where that is allowed: who asks for it for the tick is told when it is not. `tell`
-    /// gets one sentence when the device is not there, is lost, is not ready, and when it is back. It is called on the device's thread.
+    /// gets one sentence when the device is not there, is lost, is not ready, and when it is back. It is called on a thread of its own: a terminal that takes no
+    /// more lines, or has gone, must keep nobody who holds a force.
     ///
     /// # Errors
     /// When the thread cannot be started.
@@ -149,10 +168,12 @@ impl RemoteDevice {
             share: AtomicU64::new(1f64.to_bits()),
         });
         let for_thread = Arc::clone(&shared);
+        let (sender, sentences) = sync_channel::<String>(UNHEARD);
+        thread::Builder::new().name("device's word".into()).spawn(move || sentences.iter().for_each(|sentence| tell(&sentence)))?;
         let serve = move || {
             // a command that waits for a time slice is felt as a tick that came late
             drop(enter_realtime(priority, None));
-            serve(driver, &for_thread, &profile, &tell);
+            serve(driver, &for_thread, &profile, &|sentence| drop(sender.try_send(sentence.to_owned())));
         };
         let thread = thread::Builder::new().name("device".into()).spawn(serve)?;
         Ok(Self { shared, profile, mounting, last: Report::zeroed(), seen: false, status: DeviceStatus::Unplugged, thread: Some(thread) })
@@ -179,9 +200,12 @@ impl Device for RemoteDevice {
         // a place that is none is no place: the last one stays, and is not vouched for
         let mut sound = true;
         if let Some((report, _)) = self.shared.report.load::<Report>() {
-            sound = report.position_mm.iter().all(|v| v.is_finite());
-            let position_mm = if sound { report.position_mm } else { self.last.position_mm };
-            (self.last, self.seen) = (Report { position_mm, ..report }, true);
+            let (placed, turned) = (finite(&report.position_mm), finite(&report.orientation));
+            sound = placed && turned;
+            let position_mm = if placed { report.position_mm } else { self.last.position_mm };
+            // a report that says nothing of it, or nothing that makes sense, is no turn of the tool
+            let orientation = if turned && report.is_turned() { report.orientation } else { self.last.orientation };
+            (self.last, self.seen) = (Report { position_mm, orientation, ..report }, true);
         }
         self.status = match (self.seen && self.shared.connected.load(Relaxed), self.last.ready == 1) {
             (false, _) => DeviceStatus::Unplugged,
@@ -218,8 +242,9 @@ impl Device for RemoteDevice {
     }
 
     fn orientation(&self) -> Option<[f64; 4]> {
-        let told = self.last.orientation.iter().any(|&c| c != 0.0);
-        told.then(|| mounting::quaternion(mounting::product(self.mounting.rotation, mounting::matrix(self.last.orientation))))
+        self.last
+            .is_turned()
+            .then(|| mounting::quaternion(mounting::product(self.mounting.rotation, mounting::matrix(self.last.orientation))))
     }
 
     fn buttons(&self) -> u32 {
@@ -272,8 +297,15 @@ impl<D: Driver> Drop for Opened<'_, D> {
 }
 
 /// What was said last of a device, so that nothing is said twice.
+struct Said {
+    last: Word,
+    /// since when sentences are counted [ns], and how many there were
+    since_ns: u64,
+    count: u32,
+}
+
 #[derive(Clone, Copy, PartialEq)]
-enum Said {
+enum Word {
     Nothing,
     Away,
     NotReady,
@@ -283,30 +315,41 @@ enum Said {
 impl Said {
     /// The device cannot be had. A service that answers without its device is tried ten times a second: said once.
     fn away(&mut self, error: &DeviceError, tell: &dyn Fn(&str)) {
-        if *self != Self::Away {
+        if self.last != Word::Away {
             tell(&format!("{error}; it is looked for ten times a second, and the force is zero meanwhile"));
-            *self = Self::Away;
+            self.last = Word::Away;
         }
     }
 
-    /// The device has spoken.
+    /// The device has spoken. One that changes its mind again and again is heard [`OFTEN`] times a second.
     fn heard(&mut self, ready: bool, name: &str, tell: &dyn Fn(&str)) {
-        match (*self, ready) {
-            (Self::Away, true) => tell(&format!("the device ({name}) is there; its force rises over 0.5 s")),
-            (Self::NotReady, true) => tell(&format!("the device ({name}) is ready")),
-            (Self::Nothing | Self::Away | Self::Ready, false) => {
-                tell(&format!(
-                    "the device ({name}) is there but not ready: home or calibrate it, switch its power on; the force is zero meanwhile"
-                ));
-            }
-            _ => {}
+        let word = if ready { Word::Ready } else { Word::NotReady };
+        if word == self.last {
+            return;
         }
-        *self = if ready { Self::Ready } else { Self::NotReady };
+        let now = monotonic_ns();
+        if now > self.since_ns + 1_000_000_000 {
+            (self.since_ns, self.count) = (now, 0);
+        }
+        self.count += 1;
+        if self.count > OFTEN {
+            return;
+        }
+        match (self.last, ready) {
+            (Word::Away, true) => tell(&format!("the device ({name}) is there; its force rises over 0.5 s")),
+            (Word::NotReady, true) => tell(&format!("the device ({name}) is ready")),
+            (_, false) => tell(&format!(
+                "the device ({name}) is there but not ready: home or calibrate it, switch its power on; the force is zero meanwhile"
+            )),
+            (Word::Nothing | Word::Ready, true) => {}
+        }
+        self.last = word;
     }
 }
 
 fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell: &dyn Fn(&str)) {
-    let (mut said, mut warned) = (Said::Nothing, 0);
+    let (mut said, mut warned) = (Said { last: Word::Nothing, since_ns: 0, count: 0 }, Vec::new());
+    let (mut turned, mut unturned) = (false, 0);
     while !shared.stop.load(Relaxed) {
         if let Err(error) = driver.open() {
             said.away(&error, tell);
@@ -335,12 +378,21 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
             shared.report.store(&report);
             shared.connected.store(true, Relaxed);
             said.heard(report.ready == 1, profile.name, tell);
-            if report.warning != 0 && report.warning != warned {
+            if report.is_turned() {
+                (turned, unturned) = (true, 0);
+            } else if turned {
+                unturned += 1;
+                if unturned == UNTURNED {
+                    let name = profile.name;
+                    tell(&format!("the device ({name}) does not tell any more how its handle is turned; the tool stays as it was"));
+                }
+            }
+            if report.warning != 0 && !warned.contains(&report.warning) {
                 let (name, code) = (profile.name, report.warning);
                 tell(&format!(
                     "the device ({name}) warns ({code:#06x}: warm motors, or too large a force or too fast a hand for it); its force is lowered"
                 ));
-                warned = report.warning;
+                warned.push(report.warning);
             }
             shared.exchanges.fetch_add(1, Relaxed);
             shared.share.store(guard.borrow().share().to_bits(), Relaxed);

@@ -52,8 +52,17 @@ impl Mounting {
     }
 }
 
-/// The quaternion (x, y, z, w) of a rotation given row by row.
+/// Whether columns have the length of a rotation's.
+pub(crate) fn is_rotation(m: [[f64; 3]; 3]) -> bool {
+    // NaN is in no range
+    (0..3).all(|c| (0.9..=1.1).contains(&m.iter().map(|row| row[c] * row[c]).sum::<f64>()))
+}
+
+/// The quaternion (x, y, z, w) of a rotation given row by row; no numbers for what is none.
 pub(crate) fn quaternion(m: [[f64; 3]; 3]) -> [f64; 4] {
+    if !is_rotation(m) {
+        return [f64::NAN; 4];
+    }
     // the largest of the four squares is divided by: never a small one   [Shepperd 1978]
     let squares = [
         1.0 + m[0][0] - m[1][1] - m[2][2],
@@ -72,7 +81,7 @@ pub(crate) fn quaternion(m: [[f64; 3]; 3]) -> [f64; 4] {
         _ => [wx, wy, wz, s],
     };
     let length = q.iter().map(|c| c * c).sum::<f64>().sqrt();
-    if length.is_finite() && length > 1e-9 { q.map(|c| c / length) } else { [0.0, 0.0, 0.0, 1.0] }
+    q.map(|c| c / length)
 }
 
 /// The rotation of a quaternion (x, y, z, w), row by row; the identity for one that is none.
@@ -110,7 +119,9 @@ mod tests {
             }
         }
         assert_eq!(matrix([f64::NAN; 4]), Mounting::default().rotation);
-        assert_eq!(quaternion([[f64::NAN; 3]; 3]), [0.0, 0.0, 0.0, 1.0]);
+        for none in [f64::NAN, f64::INFINITY, 0.0] {
+            assert!(quaternion([[none; 3]; 3]).iter().all(|c| c.is_nan()));
+        }
     }
 
     #[test]

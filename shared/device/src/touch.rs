@@ -10,7 +10,7 @@ use crate::{
     DeviceError, Options,
     foreign::{Hd, HdFrame, c_string, hd, library},
     link::{Command, Driver, Report},
-    mounting::quaternion,
+    mounting::{is_rotation, quaternion},
 };
 use bytemuck::Zeroable;
 use std::ffi::CString;
@@ -18,6 +18,8 @@ use std::ffi::CString;
 pub(crate) const NAMES: [&str; 3] = ["libHD.so.3.4", "libHD.so.3", "libHD.so"];
 pub(crate) const PACKAGE: &str = "OpenHaptics and the Touch driver of 3D Systems";
 const DEVICE: &str = "the Touch";
+/// Frames in a row without a place after which the device counts as gone: a tenth of a second, as any stale pose.
+const UNPLACED: u32 = 100;
 
 /// Largest fall of the force's ceiling in an exchange [N].
 const LOWER_N: f64 = 0.02;
@@ -34,6 +36,8 @@ pub(crate) struct Touch {
     device: Option<u32>,
     gives_torque: bool,
     ceiling: Ceiling,
+    /// frames in a row without a place
+    unplaced: u32,
 }
 
 /// Largest force after warnings.
@@ -68,14 +72,13 @@ impl Touch {
     pub fn load(options: &Options) -> Result<Self, DeviceError> {
         let (opened, name) = library(options.library.as_deref(), &NAMES, "libHD", PACKAGE)?;
         let name_of = options.device.as_deref().and_then(c_string);
-        Ok(Self { hd: Hd::load(opened, &name)?, name: name_of, device: None, gives_torque: false, ceiling: Ceiling::NONE })
+        Ok(Self { hd: Hd::load(opened, &name)?, name: name_of, device: None, gives_torque: false, ceiling: Ceiling::NONE, unplaced: 0 })
     }
 }
 
 /// What a device says of itself has a place and a turn: all zeros, or no numbers, are none.
 fn is_pose(t: &[f64; 16]) -> bool {
-    let column = |n: usize| t[4 * n..4 * n + 3].iter().map(|c| c * c).sum::<f64>();
-    t.iter().all(|c| c.is_finite()) && (0..3).all(|n| (column(n) - 1.0).abs() < 0.1)
+    t.iter().all(|c| c.is_finite()) && is_rotation(std::array::from_fn(|row| std::array::from_fn(|n| t[4 * n + row])))
 }
 
 impl Driver for Touch {
@@ -90,7 +93,7 @@ impl Driver for Touch {
         }
         self.device = Some(device);
         self.gives_torque = self.hd.start(device).map_err(not_there)? >= 6;
-        self.ceiling = Ceiling::NONE;
+        (self.ceiling, self.unplaced) = (Ceiling::NONE, 0);
         Ok(())
     }
 
@@ -112,20 +115,23 @@ impl Driver for Touch {
             return Err(lost("libHD's servo loop does not run".into()));
         }
         let t = frame.transform;
-        if !is_pose(&t) {
+        self.unplaced = if is_pose(&t) { 0 } else { self.unplaced + 1 };
+        if self.unplaced > UNPLACED {
             return Err(lost("what libHD says of its place is none".into()));
         }
         if warns {
             self.ceiling.warned(share * wanted_n);
         }
+        // a frame without a place now and then is no device that has gone: it is not vouched for, and the force fades
+        let placed = self.unplaced == 0;
         Ok(Report {
-            position_mm: [t[12], t[13], t[14]],
+            position_mm: if placed { [t[12], t[13], t[14]] } else { [f64::NAN; 3] },
             velocity_mm_s: frame.velocity_mm_s,
             // columns to rows
             orientation: quaternion([[t[0], t[4], t[8]], [t[1], t[5], t[9]], [t[2], t[6], t[10]]]),
             buttons: frame.buttons as u64 & 0xF,
             ready: 1,
-            has_velocity: 1,
+            has_velocity: u64::from(placed),
             warning: if warns { frame.error.into() } else { 0 },
             ..Report::zeroed()
         })

@@ -9,6 +9,7 @@
 //! outputs bit by bit; every input is checked, and what is not finite is counted and replaced by the last that was.
 
 #![forbid(unsafe_code)]
+#![cfg_attr(test, allow(clippy::disallowed_macros))] // tests say what they see
 
 pub mod breathing;
 mod config;
@@ -23,7 +24,7 @@ mod tick;
 pub mod tissue;
 
 pub use breathing::{AtRest, Breathing};
-pub use config::{DeviceTip, NeedleConfig};
+pub use config::{DeviceTip, GRIP_MM, NeedleConfig};
 pub use error::NeedleError;
 pub use events::{Event, EventKind};
 pub use gauge::Gauge;

@@ -2,17 +2,19 @@
 #![allow(non_snake_case, clippy::missing_safety_doc)]
 
 use std::ffi::{c_char, c_double, c_int, c_uchar, c_uint};
-use std::sync::Mutex;
+use std::sync::{Mutex, atomic::{AtomicI32, Ordering::Relaxed}};
 
 struct State { plugged: bool, open: bool, enabled: bool, wrench: [f64; 6], watchdog: u8, position: [f64; 3], largest: f64, steepest: f64 }
 static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enabled: false, wrench: [0.0; 6], watchdog: 0, position: [0.01, 0.02, 0.03], largest: 0.0, steepest: 0.0 });
 
+static UNTURNED: AtomicI32 = AtomicI32::new(0);
+
 fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 } else { -1 } }
 
 #[unsafe(no_mangle)] pub extern "C" fn dhdGetDeviceCount() -> c_int { c_int::from(STATE.lock().unwrap().plugged) }
-#[unsafe(no_mangle)] pub extern "C" fn dhdOpenID(_index: c_char) -> c_int {
+#[unsafe(no_mangle)] pub extern "C" fn dhdOpenID(index: c_char) -> c_int {
     let mut s = STATE.lock().unwrap();
-    if s.plugged { s.open = true; 3 } else { -1 }
+    if s.plugged && index == 0 { s.open = true; 3 } else { -1 }
 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdClose(_id: c_char) -> c_int { STATE.lock().unwrap().open = false; 0 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetPosition(x: *mut c_double, y: *mut c_double, z: *mut c_double, id: c_char) -> c_int {
@@ -28,7 +30,12 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetOrientationFrame(frame: *mut [c_double; 3], _id: c_char) -> c_int {
     // a quarter turn about z, row by row
-    let turn = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]];
+    let turn = match UNTURNED.load(Relaxed) {
+        0 => [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+        1 => [[f64::NAN; 3]; 3],
+        2 => [[0.0; 3]; 3],
+        _ => return -1,
+    };
     // SAFETY: the caller gives place for nine doubles, three rows of three, as libdhd asks.
     unsafe { std::ptr::copy_nonoverlapping(turn.as_ptr(), frame, 3) };
     there()
@@ -49,6 +56,7 @@ fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 
 #[unsafe(no_mangle)] pub extern "C" fn dhdGetButtonMask(_id: c_char) -> c_uint { 2 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdErrorGetLastStr() -> *const c_char { c"no device".as_ptr() }
 // for the test
+#[unsafe(no_mangle)] pub extern "C" fn mock_unturned(kind: c_int) { UNTURNED.store(kind, Relaxed); }
 #[unsafe(no_mangle)] pub extern "C" fn mock_plug(on: c_int) { STATE.lock().unwrap().plugged = on != 0; }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn mock_force(to: *mut c_double) {
     let wrench = STATE.lock().unwrap().wrench;

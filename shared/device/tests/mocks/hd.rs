@@ -30,6 +30,9 @@ static STATE: Mutex<State> = Mutex::new(State {
 #[repr(C)]
 pub struct HDErrorInfo { code: c_uint, internal: c_int, device: c_uint }
 
+/// frames to come whose place is no number
+static UNPLACED: std::sync::atomic::AtomicI32 = std::sync::atomic::AtomicI32::new(0);
+
 #[unsafe(no_mangle)] pub extern "C" fn hdInitDevice(_name: *const c_char) -> c_uint {
     let mut s = STATE.lock().unwrap();
     if s.plugged { s.open = true; 0 } else { s.error = 0x0301; 0xFFFF_FFFF }
@@ -47,7 +50,12 @@ pub struct HDErrorInfo { code: c_uint, internal: c_int, device: c_uint }
 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn hdGetDoublev(what: c_uint, to: *mut c_double) {
     let s = STATE.lock().unwrap();
-    let p = s.position;
+    let p = if UNPLACED.load(std::sync::atomic::Ordering::Relaxed) > 0 && what == 0x2052 {
+        UNPLACED.fetch_sub(1, std::sync::atomic::Ordering::Relaxed);
+        [f64::NAN; 3]
+    } else {
+        s.position
+    };
     // a quarter turn about z, then the place
     let transform = [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, p[0], p[1], p[2], 1.0];
     let numbers: &[f64] = match what {
@@ -115,6 +123,7 @@ pub struct HDErrorInfo { code: c_uint, internal: c_int, device: c_uint }
     // SAFETY: the test gives place for three doubles.
     unsafe { std::ptr::copy_nonoverlapping(torque.as_ptr(), to, 3) };
 }
+#[unsafe(no_mangle)] pub extern "C" fn mock_unplaced(frames: c_int) { UNPLACED.store(frames, std::sync::atomic::Ordering::Relaxed); }
 #[unsafe(no_mangle)] pub extern "C" fn mock_stuck(on: c_int) { STATE.lock().unwrap().stuck = on != 0; }
 #[unsafe(no_mangle)] pub extern "C" fn mock_warns(code: c_int) { STATE.lock().unwrap().warns = code as c_uint; }
 #[unsafe(no_mangle)] pub extern "C" fn mock_directions(count: c_int) { STATE.lock().unwrap().directions = count; }
