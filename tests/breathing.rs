@@ -10,7 +10,6 @@ mod support;
 
 use maille_breathing::{Regions, Signal};
 use maille_contract::{BreathState, Role, ServiceState, Stamp, ToolState, messages::TOOL_IN_CONTACT};
-use maille_motion::signal::Trace;
 use maille_raycast::{Motion, Warp, WarpOptions};
 use maille_scene::Scene;
 use maille_store::volume_info;
@@ -266,7 +265,9 @@ fn a_trace_with_holes_plays_without_a_jump() {
         traces.push(folder.join("201205181211-LAC-1-N-320-6.csv").display().to_string());
     }
     for trace in traces {
-        let living = Living::start(&scratch, &torso(&format!("signal = \"{trace}\""), -125.0), &[]);
+        let scene = torso(&format!("signal = \"{trace}\""), -125.0);
+        let file = scratch.file("run.json");
+        let living = Living::start(&scratch, &scene, &["--report", file.to_str().unwrap()]);
         let seen = living.watch(6.0);
         let moved =
             ticks(&seen).map(|(a, b)| (apart(a.tip_reference_mm, b.tip_reference_mm), (b.stamp.time_ns - a.stamp.time_ns) as f64 * 1e-9));
@@ -274,8 +275,22 @@ fn a_trace_with_holes_plays_without_a_jump() {
         println!("{trace}: {fastest:.1} mm/s at most under the tool, of {} states", seen.len());
         // ten times the mean speed of a deep breath would be felt as a jump
         assert!(fastest > 0.5 && fastest < 60.0, "{trace}: {fastest} mm/s");
+        let said_at_start = living.run.printed();
         living.end();
+        // what was made of it is told before the run, at its start, and in its report; alike
+        let of_run = report(&file)["breathing"]["recording"].clone();
+        let path = scratch.write("scene.toml", &scene);
+        let checked = Command::new(env!("CARGO_BIN_EXE_maille")).args(["check", "--json", "--no-measure"]).arg(path).output().unwrap();
+        let checked: serde_json::Value = serde_json::from_slice(&checked.stdout).unwrap();
+        assert_eq!(of_run, checked["breathing"]["recording"]);
+        let [gaps, left_out] = ["gaps", "rows_left_out"].map(|key| of_run[key].as_u64().unwrap());
+        assert!(said_at_start.contains("rows left out"), "{said_at_start}");
+        println!("{trace}: {of_run}");
+        if trace == torn.to_str().unwrap() {
+            // counted where it was made: holes of a second behind the first, zeros that stand for nothing
+            let zeros = (0..1500).filter(|n| n % 160 >= 25 && n % 97 == 0).count() as u64;
+            assert_eq!([gaps, left_out], [9, zeros]);
+            assert!((1.0..1.1).contains(&of_run["longest_gap_s"].as_f64().unwrap()), "{of_run}");
+        }
     }
-    let gaps = Trace::from_text(&text, "torn", &Default::default()).unwrap().gaps(0.5).len();
-    assert!(gaps > 5, "it had holes: {gaps}");
 }

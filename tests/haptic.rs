@@ -16,6 +16,8 @@ mod device;
 mod resting;
 #[path = "haptic/service.rs"]
 mod service;
+#[path = "haptic/torque.rs"]
+mod torque;
 
 use device::{drive, norm, steps};
 use maille_contact::Grip;

@@ -251,3 +251,39 @@ fn the_page_holds_the_breath_leads_it_and_lets_it_go_on() {
     run.end();
     let _ = std::fs::remove_file(&scene);
 }
+
+/// A small torso that stands still, with two organs.
+const ORGANS: &str = "name = \"organs\"\n[volume]\nphantom = \"torso\"\nsize = [96, 72, 96]\n\
+                      [rendering]\nadapt = false\nsize = [240, 180]\ntransfer = \"skin\"\nfrom = [1.0, -0.3, 0.1]\n[effects]\nsections = true\n\
+                      [[organ]]\nname = \"soft\"\nhu = [[-200.0, 120.0]]\n[[organ]]\nname = \"bones\"\nhu = [[150.0, 3000.0]]\n";
+
+#[test]
+fn the_page_shows_an_organ_alone_and_the_patient_again() {
+    let Some(chromium) = chromium() else {
+        assert!(std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
+        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
+        return;
+    };
+    let scene = std::env::temp_dir().join(format!("maille-page-organs-{}.toml", std::process::id()));
+    std::fs::write(&scene, ORGANS).expect("a scene");
+    let run = Run::start(&[scene.to_str().expect("a path in UTF-8")]);
+    let mut browser = Browser::open(&chromium, &run.address, 1600, 900);
+    browser.until("the first frame", "Number(document.body?.dataset.frames ?? 0) >= 2");
+    browser.evaluate(HELPERS);
+    let names = browser.evaluate("[...document.getElementById('organ-alone').options].map((o) => o.text)");
+    assert_eq!(names, serde_json::json!(["the whole patient", "soft alone", "bones alone"]));
+    browser.evaluate("window.whole = grey('3d'); true");
+    let choose = |browser: &mut Browser, organ: u32| {
+        browser.evaluate(&format!(
+            "(() => {{ const e = document.getElementById('organ-alone'); e.value = {organ}; e.dispatchEvent(new Event('change')); return true; }})()"
+        ));
+    };
+    choose(&mut browser, 2);
+    browser.until("bones alone", "changed(whole, grey('3d')) > 0.1");
+    choose(&mut browser, 0);
+    browser.until("the whole patient", "changed(whole, grey('3d')) < 0.001");
+    assert_eq!(browser.complaints, Vec::<String>::new());
+    drop(browser);
+    run.end();
+    let _ = std::fs::remove_file(&scene);
+}

@@ -190,6 +190,8 @@ fn what_a_scene_names_and_this_machine_has_not_is_refused_before_the_run() {
         ("[device]\nlibrary = \"libc.so.6\"\n".into(), "touch", "libc.so.6 has no function hdInitDevice"),
         ("[device]\nlibrary = \"libc.so.6\"\n".into(), "forcedimension", "libc.so.6 has no function dhdGetDeviceCount"),
         ("[device]\nlibrary = \"libNone.so.9\"\n".into(), "touch", "libHD was not found"),
+        ("[device]\nid = \"left\"\n".into(), "forcedimension", "`left` is no device of libdhd, which numbers them"),
+        ("[device]\nid = \"-1\"\n".into(), "forcedimension", "`-1` is no device of libdhd"),
         ("[device]\naddress = \"nonsense\"\n".into(), "inverse3", "device.address is no address"),
         ("[haptic]\ncpu = 1023\n".into(), "path", "haptic.cpu = 1023 is none of the CPUs"),
     ] {
@@ -205,6 +207,42 @@ fn what_a_scene_names_and_this_machine_has_not_is_refused_before_the_run() {
             assert!(!out.contains("pid") && !out.contains("domain"), "nothing was started: {out}");
         }
     }
+}
+
+/// Opening a library runs what its maker wants; one that never comes back costs seconds, and its process is gone.
+#[test]
+fn a_device_s_library_that_hangs_where_it_is_opened_is_refused() {
+    let scratch = Scratch::new("run-hanging");
+    let source = "extern \"C\" fn hang() { loop { std::thread::sleep(std::time::Duration::from_secs(1)); } }\n\
+                  #[used]\n#[unsafe(link_section = \".init_array\")]\nstatic HANG: extern \"C\" fn() = hang;\n";
+    let (source, library) = (scratch.write("hang.rs", source), scratch.file("libhang.so"));
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let built = Command::new(rustc).args(["--edition", "2024", "--crate-type", "cdylib", "-o"]).arg(&library).arg(source).status();
+    assert!(built.expect("rustc runs").success());
+    let scene =
+        SMALL_SCENE.replace("[tool]\n", "[tool]\ndevice = \"touch\"\n") + &format!("[device]\nlibrary = \"{}\"\n", library.display());
+    let output = maille().args(["check", "--no-measure"]).arg(scratch.write("hanging.toml", &scene)).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    // lines are broken where a terminal would end
+    assert!(said.replace(|c: char| c.is_whitespace() || c == '│', "").contains("stillbeingopened"), "{said}");
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    let left = processes.filter(|p| std::fs::read_to_string(p.path().join("cmdline")).is_ok_and(|line| line.contains("libhang.so")));
+    assert_eq!(left.count(), 0, "nothing is left of it");
+}
+
+/// What only a service can see, once it has the voxels: told once, as a refusal, instead of tried again and again.
+#[test]
+fn a_service_that_refuses_to_start_ends_the_run_with_its_sentence() {
+    let scratch = Scratch::new("run-organ");
+    let organ = "[[organ]]\nname = \"nowhere\"\nhu = [[1.0, 2.0]]\nseed = [0.0, 0.0, 0.0]\n";
+    let output = maille().args(["run", "--headless"]).arg(scratch.write("organ.toml", &format!("{SMALL_SCENE}{organ}"))).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    let last = said.lines().last().unwrap_or_default();
+    assert!(last.starts_with("maille: the service rendering cannot start: the organ `nowhere`"), "{said}");
+    let starts = String::from_utf8_lossy(&output.stdout).matches("rendering    pid").count();
+    assert!((2..=4).contains(&starts), "two starts, two deaths: {}", String::from_utf8_lossy(&output.stdout));
 }
 
 #[test]

@@ -264,6 +264,9 @@ fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, breath: Option<&Pre
             b.spacing_error_mm,
             b.storage_error_mm
         );
+        if let Some(recorded) = &b.recorded {
+            say!("             the recording: {recorded}");
+        }
     }
     say!("\nprocesses");
     for p in &plan.processes {
@@ -313,7 +316,7 @@ fn json_of(scene: &Scene, patient: &Patient, plan: &Plan, breath: Option<&Prepar
         "tool": tool,
         "breathing": breath.map(|b| json!({
             "signal": String::from(scene.breathing.signal.clone()), "fields": b.fields, "size": b.size, "longest_mm": b.longest_mm,
-            "spacing_error_mm": b.spacing_error_mm, "storage_error_mm": b.storage_error_mm,
+            "spacing_error_mm": b.spacing_error_mm, "storage_error_mm": b.storage_error_mm, "recording": b.recorded,
             "bytes": b.segments().iter().map(|(_, _, bytes)| bytes).sum::<u64>(),
         })),
         "processes": plan.processes.iter().map(|p| json!({

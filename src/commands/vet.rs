@@ -7,11 +7,19 @@ use super::{Failure, Outcome};
 use maille_device::{Kind, Options, usable};
 use maille_realtime::allowed_cpus;
 use maille_scene::{Device, Scene};
+use rustix::process::{Pid, Signal, kill_process};
 use std::{
+    io,
     os::unix::process::{CommandExt as _, ExitStatusExt as _},
     path::PathBuf,
-    process::{Command, Stdio},
+    process::{Child, Command, Output, Stdio},
+    sync::mpsc::channel,
+    thread,
+    time::Duration,
 };
+
+/// Longest time that a vendor's library may take to open: some look for their devices while they do.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Open the library of a device, say what is wrong with it
 #[derive(clap::Args)]
@@ -21,12 +29,15 @@ pub struct Args {
     /// The vendor's shared object; without it where the system finds it
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
+    /// Which device
+    #[arg(long)]
+    id: Option<String>,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let kind = Kind::named(&args.kind).ok_or_else(|| Failure::Usage(format!("there is no device {}", args.kind)))?;
-    let options = Options { library: args.library.clone(), ..Options::default() };
+    let options = Options { library: args.library.clone(), device: args.id.clone(), ..Options::default() };
     usable(kind, &options).map_err(|e| Failure::Refused(e.to_string()))
 }
 
@@ -60,7 +71,18 @@ fn library_of(device: &str, scene: &Scene) -> Result<(), String> {
     if let Some(library) = &scene.device.library {
         command.arg("--library").arg(library);
     }
-    let done = command.stdin(Stdio::null()).stdout(Stdio::null()).output().map_err(|e| cannot(&e))?;
+    if let Some(id) = &scene.device.id {
+        command.arg(format!("--id={id}"));
+    }
+    let named = || scene.device.library.as_ref().map_or_else(|| "that the system finds".into(), |path| path.display().to_string());
+    let child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(|e| cannot(&e))?;
+    let Some(done) = output_within(child, PATIENCE).map_err(|e| cannot(&e))? else {
+        return Err(format!(
+            "the device `{device}` cannot be used: its library ({}) was still being opened after {} s; is a driver of it hanging?",
+            named(),
+            PATIENCE.as_secs()
+        ));
+    };
     if done.status.success() {
         return Ok(());
     }
@@ -68,9 +90,24 @@ fn library_of(device: &str, scene: &Scene) -> Result<(), String> {
     match (done.status.signal(), said.lines().rev().find_map(|line| line.strip_prefix("maille: "))) {
         (None, Some(sentence)) => Err(format!("the device `{device}` cannot be used: {sentence}")),
         (Some(signal), _) => {
-            let named = scene.device.library.as_ref().map_or_else(|| "that the system finds".into(), |path| path.display().to_string());
-            Err(format!("the device `{device}` cannot be used: its library ({named}) crashes where it is opened (signal {signal})"))
+            Err(format!("the device `{device}` cannot be used: its library ({}) crashes where it is opened (signal {signal})", named()))
         }
         (None, None) => Err(cannot(&done.status)),
+    }
+}
+
+/// What a process said and how it ended; one that takes longer is ended, and is `None`.
+fn output_within(child: Child, patience: Duration) -> io::Result<Option<Output>> {
+    let pid = Pid::from_child(&child);
+    let (tell, told) = channel();
+    thread::spawn(move || drop(tell.send(child.wait_with_output())));
+    match told.recv_timeout(patience) {
+        Ok(done) => done.map(Some),
+        Err(_) => {
+            // it is not waited for before the thread's `wait` returns: the number is still its own
+            kill_process(pid, Signal::KILL)?;
+            drop(told.recv());
+            Ok(None)
+        }
     }
 }

@@ -37,6 +37,8 @@ pub struct Facts {
     pub has_tool: bool,
     /// whether the scene's tool takes tissue away, so that there is something to take back
     pub incises: bool,
+    /// names of the scene's organs, of which one may be shown alone
+    pub organs: Vec<String>,
     /// name of the breathing's signal, where the patient breathes
     pub breathing: Option<String>,
 }
@@ -137,5 +139,6 @@ pub fn default_view(low: [f64; 3], high: [f64; 3]) -> ViewState {
         sections_follow_tool: 1,
         transfer_count: 0,
         transfer: [[0.0; 5]; TRANSFER_POINTS],
+        organ_alone: 0,
     }
 }

@@ -96,6 +96,7 @@ impl Live {
                 .collect(),
             has_tool: scene.tool.is_some(),
             incises: scene.has_effect("incision"),
+            organs: scene.organs.iter().map(|organ| organ.name.clone()).collect(),
             breathing: signal.is_some().then(|| scene.breathing.signal.clone().into()),
         };
         // what the last console said, or the supervisor before the first
@@ -148,6 +149,7 @@ fn scene_view(scene: &Scene, box_mm: &BoxMm) -> ViewState {
         window_center_hu: rendering.section_window_hu[0],
         window_width_hu: rendering.section_window_hu[1],
         sections_follow_tool: u64::from(scene.tool.is_some()),
+        organ_alone: scene.organ_alone(),
         ..default_view(box_mm.low, box_mm.high)
     }
 }

@@ -82,6 +82,7 @@ pub struct ViewPatch {
     pub window_width_hu: Option<f64>,
     pub sections_mm: Option<[f64; 3]>,
     pub sections_follow_tool: Option<bool>,
+    pub organ_alone: Option<u64>,
     /// HU, r, g, b, opacity over 1 mm; an empty list goes back to the scene's own
     pub transfer: Option<Vec<[f64; 5]>>,
 }
@@ -102,12 +103,13 @@ impl ViewPatch {
         new.up = self.up.unwrap_or(new.up);
         new.sections_mm = self.sections_mm.unwrap_or(new.sections_mm);
         new.sections_follow_tool = self.sections_follow_tool.map_or(new.sections_follow_tool, u64::from);
+        new.organ_alone = self.organ_alone.unwrap_or(new.organ_alone);
         if let Some(points) = &self.transfer {
             new.transfer = [[0.0; 5]; TRANSFER_POINTS];
             new.transfer.get_mut(..points.len())?.copy_from_slice(points);
             new.transfer_count = points.len() as u64;
         }
-        if new.mode > 1 || new.camera > 1 {
+        if new.mode > 1 || new.camera > 1 || new.organ_alone > 255 {
             return None;
         }
         new.checked()
@@ -182,6 +184,7 @@ pub struct View {
     pub window_width_hu: f64,
     pub sections_mm: [f64; 3],
     pub sections_follow_tool: bool,
+    pub organ_alone: u64,
     pub transfer: Vec<[f64; 5]>,
 }
 
@@ -200,6 +203,7 @@ impl From<&ViewState> for View {
             window_width_hu: v.window_width_hu,
             sections_mm: v.sections_mm,
             sections_follow_tool: v.sections_follow_tool != 0,
+            organ_alone: v.organ_alone,
             transfer: v.transfer[..(v.transfer_count as usize).min(TRANSFER_POINTS)].to_vec(),
         }
     }

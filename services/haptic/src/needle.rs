@@ -15,11 +15,11 @@ use maille_contact::shaper::{LEAVE_FADE_S, LEAVE_SLEW_N_PER_S};
 use maille_contact::{Coupling, DevicePose, DeviceProfile, Faults, ForceShaper, Limits, TickOutputs};
 use maille_contract::ControlBlock;
 use maille_contract::needle::{
-    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag, NeedleEvent,
-    NeedleLog, NeedleState,
+    LABELS_KIND, LABELS_REGION, LabelsHeader, NEEDLE_FOUND, NEEDLE_MET, NEEDLE_NODES, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleDrag,
+    NeedleEvent, NeedleLog, NeedleState,
 };
 use maille_needle::{
-    AIR, Breathing, Capsule, EventKind, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q,
+    AIR, Breathing, Capsule, EventKind, GRIP_MM, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q,
     RodParameters, Tissue, V3, limits::TIP_SHARE,
 };
 use maille_scene::{Needle, NeedleTissue, Scene};
@@ -141,6 +141,12 @@ impl NeedleStage {
         let (mut config, gauge) = config(n, &limits).map_err(fail)?;
         if let Some(device) = device {
             config.device_n_per_mm = renders_n_per_mm(device, 1.0 / scene.haptic.rate_hz).clamp(0.01, config.device_n_per_mm);
+            config.device_n_mm_per_rad = config.device_n_per_mm * GRIP_MM * GRIP_MM;
+        }
+        // what the device can give of torque is what the needle gives way at; one that can give none turns it freely
+        let most_n_mm = device_torque_n_mm.map_or(MAX_TORQUE_N_MM, |device| device.min(MAX_TORQUE_N_MM));
+        if most_n_mm > 0.0 {
+            config.max_torque_n_mm = most_n_mm;
         }
         let materials: Vec<Material> = n.tissue.iter().map(material).collect();
         let most = TIP_SHARE * config.device_n_per_mm;
@@ -149,6 +155,16 @@ impl NeedleStage {
                 "maille-haptic: springs before the needle's tip were lowered to {most:.2} N/mm, of {:.2} N/mm that the device ({}) renders passively",
                 config.device_n_per_mm, device.name
             );
+        }
+        for (row, m) in n.tissue.iter().zip(&materials) {
+            let force =
+                m.capsule.map_or(0.0, |c| c.cutting_force_n).max(if m.cutting_force_n.is_finite() { m.cutting_force_n } else { 0.0 });
+            if force >= config.max_force_n {
+                eprintln!(
+                    "maille-haptic: `{}` takes {force} N to cut, and the hand is given no more than {} N: this needle does not get through",
+                    row.name, config.max_force_n
+                );
+            }
         }
         let tool = NeedleTool::new(config, MaterialTable::new(&materials).map_err(fail)?).map_err(fail)?;
         let has_labels = scene.volume.file.is_none() || scene.volume.labels.is_some();
@@ -160,7 +176,6 @@ impl NeedleStage {
         }
         rows.by_value = n.tissue.iter().enumerate().filter_map(|(row, t)| Some((t.hu?, row as u8 + 1))).collect();
         let room = tool.path().nodes().len().max(512);
-        let most_n_mm = device_torque_n_mm.map_or(MAX_TORQUE_N_MM, |device| device.min(MAX_TORQUE_N_MM));
         let torque = Limits { max_force_n: most_n_mm, max_slew_n_per_s: 50.0 * most_n_mm, ..limits };
         let mut log: NeedleLog = bytemuck::Zeroable::zeroed();
         log.to_target_mm = [f64::NAN; 3];
@@ -216,6 +231,11 @@ impl NeedleStage {
         // where tissue gives way the needle is seen where the hand has it
         let ahead = if self.drag.is_some() { self.tool.ahead() } else { V3::zeros() };
         let out = Outputs { tip_mm: (V3::from(out.tip_mm) + ahead).into(), ..out };
+        // the parts told are those of the force that is given: less while it rises, fades or lags
+        let [wanted, given] = [out.force_n, force_n].map(|f| V3::from(f).norm());
+        let share = if wanted > 0.0 { (given / wanted).min(1.0) } else { 1.0 };
+        let [cutting_n, friction_n, base_n] = [out.cutting_n, out.friction_n, out.base_n].map(|part| part * share);
+        let out = Outputs { cutting_n, friction_n, base_n, ..out };
         self.port.pass(&handle, moment.held, force_n, torque_n_mm);
         self.note(moment, dt, &out, force_n, torque_n_mm);
         self.draw(moment.now_ns, &out, torque_n_mm, ahead);
@@ -335,6 +355,7 @@ impl NeedleStage {
                     EventKind::Contact => NEEDLE_MET,
                     EventKind::Puncture => NEEDLE_PUNCTURED,
                     EventKind::Withdrawn => NEEDLE_WITHDRAWN,
+                    EventKind::Found => NEEDLE_FOUND,
                 },
                 tissue: event.material.into(),
                 reference_mm: event.reference_mm,

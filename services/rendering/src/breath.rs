@@ -1,19 +1,20 @@
 //! The warp of a frame: where the patient who breathes lies at the frame's simulation time.
 //!
 //! The mapped fields are summed up where they lie, for the moment, and the ray caster's lattice is inverted from that sum, warm from the last frame's. The lattice is as
-//! coarse as the scene's tolerance allows at the ends of usual breathing, found once at the start; where none that is tried suffices, as with a registration's fields,
-//! a coarse one leads, and samples are found one by one in the sum itself. How far from its place anything may be drawn goes to the report for every frame.
+//! coarse as costs a frame least at the ends of usual breathing, found once at the start (`maille_raycast::warp::pitch`); where it does not suffice, as with a
+//! registration's fields, samples are found one by one in the sum itself. How far from its place anything may be drawn goes to the report for every frame.
 
 use maille_breathing::Patient;
 use maille_contract::ControlBlock;
 use maille_motion::{Breath, Collapsed, MotionAt};
-use maille_raycast::{Warp, WarpOptions, WarpReport};
+use maille_raycast::{
+    Warp, WarpOptions, WarpReport,
+    warp::pitch::{PITCHES_MM, Tried, cheapest},
+};
 use maille_volume::VolumeInfo;
 
-/// Distances of the lattice's nodes that are tried, coarsest first [mm].
-const PITCHES_MM: [f32; 8] = [16.0, 12.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.5];
-/// Distance of nodes where no lattice suffices and they only lead samples to where they are found one by one [mm].
-const LEADING_MM: f32 = 8.0;
+/// The deepest of usual breath: a lattice that begins with it has room for all that follows.
+const DEEPEST: Breath = Breath { level: 1.0, rate: 0.0, phase: 0.0 };
 /// No finer lattice than this [nodes]: 64 MiB.
 const MOST_NODES: f64 = 4e6;
 
@@ -29,8 +30,8 @@ pub(crate) struct Breather<'a> {
     view_mm: f32,
     /// whether sections or rays ask the field itself
     keep_field: bool,
-    /// lattices that were tried, coarsest first: distance of nodes, and how far from its place anything was drawn by it alone [mm]
-    tried: Vec<(f32, f32)>,
+    /// lattices that were tried, coarsest first
+    tried: Vec<Tried>,
 }
 
 impl<'a> Breather<'a> {
@@ -50,24 +51,25 @@ impl<'a> Breather<'a> {
         let tried = |&pitch: &f32| nodes(pitch) <= MOST_NODES && (pitch >= finest || pitch >= PITCHES_MM[0]);
         for pitch in PITCHES_MM.into_iter().filter(tried) {
             breather.warp = Warp::new(info, options(pitch));
-            // both ends of a breath; deepest first, so that the lattice has room for all that follows
-            let usual = [Breath { level: 1.0, rate: 0.0, phase: 0.0 }, Breath::EXPIRED, Breath { level: 0.5, rate: -0.8, phase: 0.25 }];
-            let worst = usual.map(|breath| breather.bend(breath).lattice_mm).into_iter().fold(0.0, f32::max);
-            breather.tried.push((pitch, worst));
-            if f64::from(worst + breather.view_mm) <= tolerance_mm {
-                return breather;
+            // both ends of a breath
+            let usual = [DEEPEST, Breath::EXPIRED, Breath { level: 0.5, rate: -0.8, phase: 0.25 }];
+            let found = Tried::of(pitch, usual.map(|breath| breather.bend(breath)));
+            breather.tried.push(found);
+            let best = cheapest(&breather.tried, within_mm);
+            if breather.tried.iter().any(|tried| tried.pitch_mm == best && found.is_last(tried)) {
+                break;
             }
         }
-        breather.warp = Warp::new(info, options(LEADING_MM));
+        breather.warp = Warp::new(info, options(cheapest(&breather.tried, within_mm)));
+        breather.bend(DEEPEST);
         breather
     }
 
-    /// Another tolerance [mm], no finer than the one that it was made for: the coarsest lattice of those tried that keeps within it, or the one that only leads.
+    /// Another tolerance [mm], no finer than the one that it was made for.
     pub fn set_tolerance(&mut self, tolerance_mm: f64) {
         let within_mm = 0.66 * tolerance_mm as f32;
         self.view_mm = 0.5 * within_mm;
-        let fits = |(_, off_mm): &&(f32, f32)| f64::from(off_mm + self.view_mm) <= tolerance_mm;
-        let pitch_mm = self.tried.iter().find(fits).map_or(LEADING_MM, |(pitch_mm, _)| *pitch_mm);
+        let pitch_mm = cheapest(&self.tried, within_mm);
         self.warp =
             Warp::new(&self.info, WarpOptions { tolerance_mm: within_mm, pitch_mm, keep_field: self.keep_field, ..WarpOptions::default() });
         self.collapsed = Collapsed::new(self.patient.model(), tolerance_mm as f32);

@@ -1,13 +1,13 @@
 //! A frame: the views drawn, then laid side by side in one sample.
 
-use crate::{backend::Backend, meshes::Meshes, overlay, view::View};
+use crate::{backend::Backend, meshes::Meshes, organs::Organs, overlay, view::View};
 use maille_contract::{
     FrameHeader, Switches, ToolState,
     messages::{VIEWS, ViewRect},
 };
 use maille_raycast::{
-    Camera, Capsule, Extras, Geometry, Labels, Overlay, Picture, Plane, Quality, RenderError, Section, Settings, Skip, Step, Ultrasound,
-    Warp, WarpScheme as Rays, render_extra, resampled, ultrasound,
+    Camera, Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Settings, Skip, Step, Ultrasound, Warp,
+    WarpScheme as Rays, render_extra, resampled, ultrasound,
 };
 use maille_scene::{Scene, WarpScheme, registry};
 use maille_transport::{Stopwatch, monotonic_ns};
@@ -48,7 +48,7 @@ pub(crate) struct Composer {
     /// surfaces seen from near are those of the smooth function
     zoom: bool,
     /// the scene's organs
-    pub labels: Option<Labels>,
+    pub organs: Option<Organs>,
     /// the scene's meshes, where the patient is
     pub meshes: Meshes,
 }
@@ -76,7 +76,7 @@ impl Composer {
             coarse: Picture::new(0, 0),
             view_ns: 0,
             zoom,
-            labels: None,
+            organs: None,
             meshes: Meshes::default(),
         }
     }
@@ -131,6 +131,7 @@ impl Composer {
         let tool_body = tool.filter(|_| held).and_then(overlay::body);
         let capsules = needle.filter(|_| held).unwrap_or(tool_body.as_slice());
         let meshes = self.meshes.views();
+        let labels = self.organs.as_mut().map(|organs| organs.show(view.organ_alone()));
         let bodies = Geometry { capsules, meshes: &meshes };
         let [w, h] = [whole.width, whole.height].map(|n| self.quality.pixels(n));
         // what is thinner than a pixel would be dots where it meets the middles of pixels
@@ -146,7 +147,7 @@ impl Composer {
         let extras = Extras {
             warp,
             scheme,
-            labels: self.labels.as_ref(),
+            labels,
             geometry: Some(if at_tip { &inside_tool } else { &in_3d }),
             barrel: view.barrel(at_tip),
             zoom: self.zoom,
@@ -174,13 +175,7 @@ impl Composer {
         for (plane, picture) in PLANES.into_iter().zip(sections).filter(|(_, p)| p.width > 0) {
             let at = plane.normal_axis().and_then(|axis| view.section_mm(axis, tool));
             let whole = Section::whole(source.info(), plane, at, picture.width, picture.height);
-            let overlay = Overlay {
-                warp,
-                labels: self.labels.as_ref(),
-                displacement_mm: self.overlay_mm,
-                geometry: Some(&bodies),
-                steps: self.section_steps,
-            };
+            let overlay = Overlay { warp, labels, displacement_mm: self.overlay_mm, geometry: Some(&bodies), steps: self.section_steps };
             self.backend.section(source, &Section { level, window, ..whole }, &overlay, picture);
         }
         watch.split("sections");

@@ -105,7 +105,7 @@ fn frames<W: Stopwatch + Send>(
     let asks_field = scene.rendering.warp_scheme == WarpScheme::FixedPoint || scene.rendering.section_steps > 0;
     let mut breather = pool.install(|| patient.map(|patient| breath::Breather::new(patient, reader.info(), tolerance_mm, asks_field)));
     composer.backend = backend::Backend::of(scene, reader);
-    composer.labels = pool.install(|| organs::labels(scene, &reader.rest()))?;
+    composer.organs = pool.install(|| organs::organs(scene, &reader.rest()))?;
     composer.meshes = pool.install(|| meshes::Meshes::of(scene, &reader.rest()))?;
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;

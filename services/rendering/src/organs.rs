@@ -9,8 +9,16 @@ use maille_scene::{BoxMm, Scene};
 use maille_surface::{Organ, Selection, organ};
 use maille_volume::BrickSource;
 
-/// Labels of the scene's organs, numbered from 1; `None` in a scene without. With `rendering.alone` everything else lets light through.
-pub(crate) fn labels(scene: &Scene, rest: &impl BrickSource) -> Result<Option<Labels>, RenderingError> {
+/// The scene's organs, one of which may be shown alone: then everything else lets light through.
+pub(crate) struct Organs {
+    labels: Labels,
+    colors: [[f32; 4]; 256],
+    count: usize,
+    alone: usize,
+}
+
+/// Labels of the scene's organs, numbered from 1; `None` in a scene without.
+pub(crate) fn organs(scene: &Scene, rest: &impl BrickSource) -> Result<Option<Organs>, RenderingError> {
     if scene.organs.is_empty() {
         return Ok(None);
     }
@@ -24,15 +32,29 @@ pub(crate) fn labels(scene: &Scene, rest: &impl BrickSource) -> Result<Option<La
             }
         }
     }
-    let mut labels = Labels::new(grid.size, voxels).map_err(|reason| RenderingError::Organ { name: "all".into(), reason })?;
-    if let Some(alone) = &scene.rendering.alone {
-        let number = 1 + scene.organs.iter().position(|organ| organ.name == *alone).unwrap_or(0);
-        // as the transfer function has it, and nothing beside it
-        labels.opacity = [0.0; 256];
-        labels.opacity[number] = 1.0;
-        labels.colors[number][3] = 0.0;
+    let labels = Labels::new(grid.size, voxels).map_err(|reason| RenderingError::Organ { name: "all".into(), reason })?;
+    // colours as they are where nothing is alone
+    let colors = labels.colors;
+    Ok(Some(Organs { labels, colors, count: scene.organs.len(), alone: 0 }))
+}
+
+impl Organs {
+    /// Shows an organ alone, by its number from 1, or with 0 (or one that is none) the whole patient.
+    pub fn show(&mut self, alone: usize) -> &Labels {
+        let alone = if alone <= self.count { alone } else { 0 };
+        if alone != self.alone {
+            self.alone = alone;
+            self.labels.colors = self.colors;
+            self.labels.opacity = [1.0; 256];
+            if alone > 0 {
+                // as the transfer function has it, and nothing beside it
+                self.labels.opacity = [0.0; 256];
+                self.labels.opacity[alone] = 1.0;
+                self.labels.colors[alone][3] = 0.0;
+            }
+        }
+        &self.labels
     }
-    Ok(Some(labels))
 }
 
 /// One organ of a scene.
@@ -86,7 +108,7 @@ mod tests {
     fn drawn(scene: &Scene, bricks: &BrickedVolume) -> [Vec<u8>; 2] {
         let view = View::new(scene, &BoxMm::of(&bricks.info().grid)).expect("a view");
         let mut composer = Composer::new(scene);
-        composer.labels = labels(scene, bricks).expect("the organs are there");
+        composer.organs = organs(scene, bricks).expect("the organs are there");
         composer.draw(bricks, None, &view, None, false, None, &mut Untimed).expect("it can be drawn");
         [0, 2].map(|n| composer.pictures[n].rgb.clone())
     }
@@ -154,13 +176,30 @@ mod tests {
     }
 
     #[test]
+    fn what_is_shown_alone_can_be_switched_to_and_fro() {
+        let bricks = balls();
+        let mut organs = organs(&scene(""), &bricks).expect("they are there").expect("some");
+        let seen = |labels: &Labels| (labels.opacity, labels.colors);
+        let whole = seen(organs.show(0));
+        for alone in [1, 2] {
+            let (opacity, colors) = seen(organs.show(alone));
+            assert_eq!((opacity[alone], opacity.iter().sum::<f32>()), (1.0, 1.0), "{alone} and nothing else");
+            assert_eq!(colors[alone][3], 0.0, "in the transfer function's own colour");
+            assert_eq!(colors[3 - alone], whole.1[3 - alone]);
+        }
+        assert_eq!(seen(organs.show(3)), whole, "one that is none is the whole patient");
+        organs.show(2);
+        assert_eq!(seen(organs.show(0)), whole);
+    }
+
+    #[test]
     fn an_organ_that_is_not_there_is_said() {
         let bricks = balls();
         for (from, to) in [("[17.0, 0.0, 0.0]", "[1.0, 0.0, 0.0]"), ("[17.0, 0.0, 0.0]", "[170.0, 0.0, 0.0]")] {
             let mut scene = scene("");
             let moved: Scene = Scene::parse("moved", &scene.to_toml().replace(from, to)).expect("a scene");
             scene.organs = moved.organs;
-            let error = labels(&scene, &bricks).unwrap_err().to_string();
+            let error = organs(&scene, &bricks).err().expect("no such organ").to_string();
             assert!(error.contains("left"), "{error}");
         }
     }

@@ -28,7 +28,7 @@ impl<'a> Turns<'a> {
         let view = View::new(scene, &BoxMm::of(&reader.info().grid))?;
         let breather = patient.map(|patient| Breather::new(patient, reader.info(), scene.breathing.picture_tolerance_mm, false));
         let mut composer = Composer::new(scene);
-        composer.labels = organs::labels(scene, &reader.rest())?;
+        composer.organs = organs::organs(scene, &reader.rest())?;
         composer.meshes = meshes::Meshes::of(scene, &reader.rest())?;
         let bodies = scene.has_effect("needle").then(Vec::new);
         Ok(Self { control: ControlMap::open(domain)?, reader, composer, view, breather, bodies })

@@ -17,6 +17,7 @@ pub(crate) struct View {
     window_hu: [f64; 2],
     step: Step,
     opacity_end: f64,
+    organ_alone: u64,
     scale: f64,
     turns: u64,
     shading: bool,
@@ -39,6 +40,7 @@ impl View {
             window_hu: r.section_window_hu,
             step: Step::Voxels(r.step),
             opacity_end: r.opacity_end,
+            organ_alone: scene.organ_alone(),
             scale: r.scale,
             turns: 0,
             shading: r.shading,
@@ -121,6 +123,11 @@ impl View {
     /// Barrel distortion of the 3D view's lens.
     pub fn barrel(&self, at_tip: bool) -> f64 {
         if at_tip { self.endoscope_barrel } else { 0.0 }
+    }
+
+    /// Number of the scene's organ that is shown alone, from 1; 0 shows the whole patient.
+    pub fn organ_alone(&self) -> usize {
+        self.page.map_or(self.organ_alone, |p| p.organ_alone) as usize
     }
 
     /// The 3D view's settings.

@@ -46,7 +46,7 @@ mod watch;
 
 pub use enter::enter;
 pub use error::SupervisorError;
-pub use report::RunReport;
+pub use report::{BreathingReport, RunReport};
 
 use fronts::Fronts;
 use maille_contract::Role;
@@ -151,8 +151,16 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     for notice in &patient.1 {
         eprintln!("maille: {notice}");
     }
+    let breathing = ready.breath.as_ref().map(|b| BreathingReport {
+        signal: scene.breathing.signal.clone().into(),
+        longest_mm: b.longest_mm,
+        recording: b.recorded,
+    });
     let mut simulation = Simulation::create(scene, &patient, &ready, &options.by_hand)?;
     say!("domain       {}", simulation.domain());
+    if let Some((b, recording)) = breathing.as_ref().and_then(|b| Some((b, b.recording?))) {
+        say!("breathing    {}: {recording}", b.signal);
+    }
     drop((patient, ready));
 
     simulation.control.timed.store(u64::from(options.stages), Relaxed);
@@ -165,7 +173,7 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     let report = simulation.end(outcome.as_ref().unwrap_or(&"failure"));
     drop(simulation);
     output::flush(LAST_WORDS);
-    let report = finish(RunReport { scene: names.scene, volume: names.volume, ..report }, options)?;
+    let report = finish(RunReport { scene: names.scene, volume: names.volume, breathing, ..report }, options)?;
     outcome.map(|_| report)
 }
 

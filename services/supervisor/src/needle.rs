@@ -6,7 +6,7 @@ use crate::{
 };
 use maille_contract::{
     ControlBlock,
-    needle::{NEEDLE_EVENTS, NEEDLE_MET, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleLog},
+    needle::{NEEDLE_EVENTS, NEEDLE_FOUND, NEEDLE_MET, NEEDLE_PUNCTURED, NEEDLE_WITHDRAWN, NeedleLog},
 };
 use maille_scene::Scene;
 use serde::Serialize;
@@ -85,9 +85,10 @@ impl NeedleReport {
                     NEEDLE_MET => "met",
                     NEEDLE_PUNCTURED => "punctured",
                     NEEDLE_WITHDRAWN => "withdrawn",
+                    NEEDLE_FOUND => "found inside",
                     _ => "unknown",
                 },
-                tissue: row(e.tissue).map_or_else(|| "air".into(), |row| row.name.clone()),
+                tissue: row(e.tissue).map_or_else(|| "what no row fits".into(), |row| row.name.clone()),
                 forbidden: row(e.tissue).is_some_and(|row| row.forbidden),
                 time_s: e.time_ns as f64 * 1e-9,
                 depth_mm: e.depth_mm,

@@ -32,6 +32,7 @@
 //! | `services.rendering.coarse_frames` | frames whose 3D view was drawn more coarsely than the scene asks for, to be in time |
 //! | `services.rendering.gpu` | in a scene with `backend = "gpu"`: `frames` all of whose pictures it drew, `failures`: pictures that the CPU drew in its place, and starts without it |
 //! | `services.rendering.warp` | in a scene that breathes: `unsettled` nodes of all frames' warps, `error_mm`, how far from its place anything in a frame may be drawn: `p50`, `p99`, `p999`, `max` |
+//! | `breathing` | in a scene that breathes: `signal` that leads it, `longest_mm` of the fields, and of a recorded trace `recording`: `breaths`, `period_s`, `ends` [the file's unit], `duration_s`, `loop_s` before it repeats, `rows` played, `rows_left_out` that were no measurement or out of reach, `gaps` (longer than three sampling periods), `longest_gap_s`, `delay_s` of the filter |
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
@@ -41,6 +42,7 @@
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
 use crate::{events::Event, governor::GovernorReport, memory::MIB, needle::NeedleReport, recording::RecordingReport, watch::Post};
+use maille_breathing::RecordedReport;
 use maille_contract::{
     ControlBlock, Role,
     control::{Counter, StageCell},
@@ -243,6 +245,16 @@ pub struct StoreReport {
     pub spare_slots_low: Option<u64>,
 }
 
+/// How the patient breathed.
+#[derive(Clone, Debug, Default, Serialize)]
+#[allow(missing_docs)] // the module's table says it
+pub struct BreathingReport {
+    pub signal: String,
+    pub longest_mm: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recording: Option<RecordedReport>,
+}
+
 /// What a run did.
 #[derive(Clone, Debug, Default, Serialize)]
 #[allow(missing_docs)] // the module's table says it
@@ -254,6 +266,8 @@ pub struct RunReport {
     pub ended_by: String,
     pub services: BTreeMap<String, ServiceReport>,
     pub store: StoreReport,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub breathing: Option<BreathingReport>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub needle: Option<NeedleReport>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -423,6 +437,9 @@ impl fmt::Display for RunReport {
                 let bound = bound.map_or("more".into(), |us| format!("{us} µs"));
                 writeln!(f, "{bound:>24} {tick:>9} {late:>9}")?;
             }
+        }
+        if let Some((b, recording)) = self.breathing.as_ref().and_then(|b| Some((b, b.recording.as_ref()?))) {
+            writeln!(f, "\nbreathing by {}: {recording}", b.signal)?;
         }
         if let Some(n) = &self.needle {
             let mm = |d: Option<f64>| d.map_or("-".into(), |d| format!("{d:.1} mm"));

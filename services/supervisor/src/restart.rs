@@ -3,6 +3,7 @@
 //! A service that had been ready for [`SETTLED`] is started again at once: whatever killed it came from outside or
 //! is rare. One that dies sooner would spin, so it waits 100 ms, 200 ms, 400 ms …, and the fifth such death within
 //! [`WINDOW`] ends the run: a person should see the evidence rather than a machine that tries for ever.
+//! A service that before it was ready refuses to start twice with the same sentence ends it too (`watch`).
 //!
 //! Pure: times come in as nanoseconds of CLOCK_MONOTONIC.
 

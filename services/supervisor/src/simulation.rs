@@ -321,6 +321,7 @@ fn first_view(scene: &Scene, volume: &Volume) -> ViewState {
         sections_follow_tool: u64::from(scene.tool.is_some()),
         transfer_count: 0,
         transfer: [[0.0; 5]; TRANSFER_POINTS],
+        organ_alone: scene.organ_alone(),
     }
 }
 

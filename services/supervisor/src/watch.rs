@@ -35,6 +35,8 @@ const BEAT: Duration = Duration::from_nanos(SUPERVISOR_BEAT_NS / 5 * 4);
 const MEMORY_PERIOD_NS: u64 = 2_000_000_000;
 /// The run's duration counts from when all are ready, but from this long after the start at the latest [ns].
 const START_AT_MOST_NS: u64 = 5_000_000_000;
+/// How a process ends that refuses what it is asked for, with a sentence.
+const REFUSAL: &str = "exit status 1";
 /// How long services may take to end when asked, before they are killed.
 const END_TIME: Duration = Duration::from_millis(1_000);
 /// How long the kernel may take to end a process that was killed.
@@ -60,6 +62,8 @@ pub struct Post {
     ready_ns: Option<u64>,
     late: bool,
     deaths: Vec<String>,
+    /// why the last process would not start
+    refusal: Option<String>,
 }
 
 impl Post {
@@ -78,6 +82,7 @@ impl Post {
             ready_ns: None,
             late: false,
             deaths: Vec::new(),
+            refusal: None,
         }
     }
 
@@ -238,6 +243,13 @@ impl Watch<'_> {
             evidence += "\n    ";
             evidence += line;
         }
+        // what it refuses twice for the same reason it will refuse again
+        let said = process.tail().filter_map(|line| line.strip_prefix("maille: ")).last().map(str::to_owned);
+        let refusal = said.filter(|_| how == REFUSAL && ready_ns.is_none());
+        if let Some(sentence) = refusal.as_ref().filter(|_| refusal == post.refusal) {
+            return Err(SupervisorError::Refused(format!("the service {} cannot start: {sentence}", post.role.word())));
+        }
+        post.refusal = refusal;
         post.deaths.push(evidence);
         match post.restarts.died(now, ready_ns) {
             Decision::AtOnce => {

@@ -19,6 +19,7 @@ mod patient;
 mod prepare;
 mod signal;
 
+pub use maille_motion::signal::RecordedReport;
 pub use patient::{Patient, Regions};
 pub use prepare::{Prepared, prepare};
 pub use signal::Signal;

@@ -1,6 +1,6 @@
 //! Before a run: the model is read or made and brought to the scene's resolution, the trace is read and tried.
 
-use crate::{BreathingError, EFFECT, Signal};
+use crate::{BreathingError, EFFECT, RecordedReport, Signal};
 use maille_contract::{
     MotionHeader,
     breath::{MOTION_KIND, MOTION_REGION, TRACE_KIND, TRACE_REGION},
@@ -19,6 +19,8 @@ pub struct Prepared {
     model: Vec<u8>,
     header: MotionHeader,
     trace: Option<String>,
+    /// what was made of the recorded trace that leads it: gaps, rows left out
+    pub recorded: Option<RecordedReport>,
     /// nodes along the axes of the fields
     pub size: [usize; 3],
     /// number of fields
@@ -45,7 +47,7 @@ pub fn prepare(scene: &Scene, volume: &Grid) -> Result<Option<Prepared>, Breathi
         _ => None,
     };
     // tried here, so that a trace that cannot be played is told before anything starts
-    drop(Signal::new(&scene.breathing, trace.as_deref())?);
+    let recorded = Signal::new(&scene.breathing, trace.as_deref())?.recorded().copied();
     let (spacing, precision) =
         (scene.breathing.field_spacing_mm, if scene.breathing.precision_bits > 16 { Precision::F32 } else { Precision::I16 });
     let (model, spacing_error_mm) = match (&scene.breathing.model, scene.volume.source()) {
@@ -77,6 +79,7 @@ pub fn prepare(scene: &Scene, volume: &Grid) -> Result<Option<Prepared>, Breathi
         header: MotionHeader { bytes: bytes.len() as u64, storage_error_mm },
         model: bytes,
         trace,
+        recorded,
         size: model.grid().size,
         fields: model.fields().len(),
         longest_mm: f64::from(longest(0.0).max(longest(1.0))),

@@ -5,7 +5,9 @@ use maille_contract::{
     BreathLead, BreathState, ControlBlock, Stamp,
     breath::{BREATH_AHEAD_NS, TRACE_KIND, TRACE_REGION},
 };
-use maille_motion::signal::{BreathStatistics, Conditioning, CsvOptions, Ease, Live, LiveState, Recorded, Synthetic, Trace};
+use maille_motion::signal::{
+    BreathStatistics, Conditioning, CsvOptions, Ease, Live, LiveState, Recorded, RecordedReport, Synthetic, Trace,
+};
 use maille_motion::{Bounded, Breath, Breathing};
 use maille_scene::{Scene, breathing};
 use maille_store::Region;
@@ -43,6 +45,7 @@ pub struct Signal {
     live: Live<Bounded<Scaled<Base>>>,
     state: BreathState,
     seen: u64,
+    recorded: Option<RecordedReport>,
 }
 
 impl Signal {
@@ -71,12 +74,22 @@ impl Signal {
                 return Err(BreathingError::Scene(format!("the trace {} was not brought along", file.display())));
             }
         };
+        let recorded = match &base {
+            Base::Recorded(signal) => Some(*signal.report()),
+            _ => None,
+        };
         let untouched = lead_of(&LiveState::untouched());
         Ok(Self {
             live: Live::new(Bounded(Scaled(base, scene.depth))),
             state: BreathState { stamp: Stamp::default(), leads: [untouched; 2], held: 0, led: 0 },
             seen: 0,
+            recorded,
         })
+    }
+
+    /// What was made of the recording that it plays; `None` where it plays none.
+    pub fn recorded(&self) -> Option<&RecordedReport> {
+        self.recorded.as_ref()
     }
 
     /// The signal of a running scene; `None` when it does not breathe.

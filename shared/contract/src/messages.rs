@@ -108,7 +108,7 @@ pub const TRANSFER_POINTS: usize = 12;
 /// The whole state each time, so that only the latest matters.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("maille.ViewState/v1")]
+#[type_name("maille.ViewState/v2")]
 pub struct ViewState {
     /// sender's stamp
     pub stamp: Stamp,
@@ -138,6 +138,8 @@ pub struct ViewState {
     pub transfer_count: u64,
     /// HU, r, g, b (0–1), opacity over 1 mm; rising in HU
     pub transfer: [[f64; 5]; TRANSFER_POINTS],
+    /// number of the scene's organ that the 3D view shows alone, from 1; 0 shows the whole patient
+    pub organ_alone: u64,
 }
 
 /// The page takes the tool, moves it, or lets it go. Writer: console. Reader: haptic.

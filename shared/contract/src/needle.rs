@@ -59,6 +59,8 @@ pub const NEEDLE_MET: u64 = 1;
 pub const NEEDLE_PUNCTURED: u64 = 2;
 /// The needle left the patient.
 pub const NEEDLE_WITHDRAWN: u64 = 3;
+/// The tip is in a tissue that it was not seen to cut its way to.
+pub const NEEDLE_FOUND: u64 = 4;
 
 /// Something that happened to the tip.
 #[repr(C)]

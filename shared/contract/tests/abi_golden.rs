@@ -39,8 +39,8 @@ fn messages_keep_their_names_sizes_and_offsets() {
     message!(ToolState, "maille.ToolState/v2", 200, stamp: 0, tip_mm: 24, proxy_mm: 48, direction: 72, force_n: 96, penetration_mm: 120, radius_mm: 128, flags: 136, epoch: 144, tip_reference_mm: 152, direction_reference: 176);
     message!(ToolMove, "maille.ToolMove/v1", 136, stamp: 0, tip_mm: 24, outside_mm: 48, contact_mm: 72, normal: 96, depth_mm: 120, radius_mm: 128);
     message!(Commit, "maille.Commit/v1", 88, stamp: 0, epoch: 24, cause: 32, moved_elements: 40, bricks: 48, step_ns: 56, refused_mm: 64);
-    message!(ViewState, "maille.ViewState/v1", 664, stamp: 0, threshold_hu: 24, mode: 32, camera: 40, eye_mm: 48, target_mm: 72, up: 96, fov_deg: 120, window_center_hu: 128,
-        window_width_hu: 136, sections_mm: 144, sections_follow_tool: 168, transfer_count: 176, transfer: 184);
+    message!(ViewState, "maille.ViewState/v2", 672, stamp: 0, threshold_hu: 24, mode: 32, camera: 40, eye_mm: 48, target_mm: 72, up: 96, fov_deg: 120, window_center_hu: 128,
+        window_width_hu: 136, sections_mm: 144, sections_follow_tool: 168, transfer_count: 176, transfer: 184, organ_alone: 664);
     message!(ToolCommand, "maille.ToolCommand/v1", 64, stamp: 0, taken: 24, target_mm: 32, sent_ns: 56);
     message!(ViewRect, "maille.ViewRect/v1", 16, offset: 0, width: 8, height: 12);
     message!(FrameHeader, "maille.FrameHeader/v3", 152, stamp: 0, epoch: 24, view_sequence: 32, render_ns: 40, shown_ns: 48, views: 56);

@@ -14,6 +14,8 @@ pub enum DeviceError {
     FunctionMissing { library: String, function: &'static str },
     #[error("{device} is not there: {reason}")]
     NotThere { device: &'static str, reason: String },
+    #[error("device.id = `{id}` is no device of libdhd, which numbers them; write \"0\" for the first, \"1\" for the second")]
+    NoNumber { id: String },
     #[error("{device} stopped answering: {reason}")]
     Lost { device: &'static str, reason: String },
     #[error("the thread of the device could not start: {0}")]

@@ -1,5 +1,7 @@
 //! Force Dimension's devices by libdhd. An exchange sets the wrench and reads the pose; the pace is kept at 1 kHz.
 //!
+//! Several devices are told apart by libdhd's own number, from 0 on.
+//!
 //! libdhd's frame: x towards the user, y right, z up; m, N and N·m.
 
 use crate::{
@@ -21,14 +23,17 @@ const WATCHDOG: u8 = 5;
 
 pub(crate) struct ForceDimension {
     dhd: Dhd,
+    /// which of the devices that are plugged in
+    number: i8,
     id: Option<i8>,
     next_ns: u64,
 }
 
 impl ForceDimension {
     pub fn load(options: &Options) -> Result<Self, DeviceError> {
+        let number = options.device.as_deref().map_or(Ok(0), number)?;
         let (opened, name) = library(options.library.as_deref(), &NAMES, "libdhd", PACKAGE)?;
-        Ok(Self { dhd: Dhd::load(opened, &name)?, id: None, next_ns: 0 })
+        Ok(Self { dhd: Dhd::load(opened, &name)?, number, id: None, next_ns: 0 })
     }
 
     /// Devices that are plugged in.
@@ -37,10 +42,15 @@ impl ForceDimension {
     }
 }
 
+/// The device that is meant, as libdhd counts them.
+fn number(id: &str) -> Result<i8, DeviceError> {
+    id.trim().parse().ok().filter(|number| *number >= 0).ok_or_else(|| DeviceError::NoNumber { id: id.into() })
+}
+
 impl Driver for ForceDimension {
     fn open(&mut self) -> Result<(), DeviceError> {
         let not_there = |reason| DeviceError::NotThere { device: "the Force Dimension device", reason };
-        let id = i8::try_from(self.dhd.open()).ok().filter(|id| *id >= 0);
+        let id = i8::try_from(self.dhd.open(self.number)).ok().filter(|id| *id >= 0);
         let Some(id) = id else { return Err(not_there(self.dhd.why())) };
         self.id = Some(id);
         if self.dhd.enable(id, WATCHDOG) < 0 {

@@ -274,10 +274,10 @@ impl Dhd {
         unsafe { (self.device_count)() }
     }
 
-    /// Opens the first device; its id, negative when that fails.
-    pub fn open(&self) -> i32 {
+    /// Opens a device by its number among those plugged in; its id, negative when that fails.
+    pub fn open(&self, number: i8) -> i32 {
         // SAFETY: takes an index by value.
-        unsafe { (self.open_id)(0) }
+        unsafe { (self.open_id)(number as c_char) }
     }
 
     /// Lets a device go.

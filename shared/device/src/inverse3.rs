@@ -7,12 +7,13 @@
 use crate::{
     DeviceError, Options,
     link::{Command, Driver, Report},
+    resolve::Resolver,
 };
 use bytemuck::Zeroable;
 use serde_json::{Value, json};
 use std::{
     io::{self, Read, Write},
-    net::{TcpStream, ToSocketAddrs},
+    net::TcpStream,
     time::{Duration, Instant},
 };
 use tungstenite::{Message, WebSocket};
@@ -37,6 +38,7 @@ const DEVICE: &str = "the Inverse3";
 
 pub(crate) struct Inverse3 {
     address: String,
+    resolver: Resolver,
     protocol: Protocol,
     wanted: Option<String>,
     socket: Option<WebSocket<Timely>>,
@@ -46,7 +48,14 @@ pub(crate) struct Inverse3 {
 
 impl Inverse3 {
     pub fn new(options: &Options) -> Self {
-        Self { address: options.address.clone(), protocol: options.protocol, wanted: options.device.clone(), socket: None, session: None }
+        Self {
+            address: options.address.clone(),
+            resolver: Resolver::default(),
+            protocol: options.protocol,
+            wanted: options.device.clone(),
+            socket: None,
+            session: None,
+        }
     }
 
     /// Takes a state; `None` when it holds no such device.
@@ -152,8 +161,7 @@ fn lost(reason: impl ToString) -> DeviceError {
 impl Driver for Inverse3 {
     fn open(&mut self) -> Result<(), DeviceError> {
         let not_there = |reason: String| DeviceError::NotThere { device: DEVICE, reason };
-        let address = self.address.to_socket_addrs().map_err(|e| not_there(e.to_string()))?.next();
-        let address = address.ok_or_else(|| not_there(format!("{} is no address", self.address)))?;
+        let address = self.resolver.resolve(&self.address, PATIENCE).map_err(|e| not_there(e.to_string()))?;
         let stream = TcpStream::connect_timeout(&address, PATIENCE).map_err(|e| not_there(e.to_string()))?;
         // small messages at once
         stream.set_nodelay(true).map_err(lost)?;

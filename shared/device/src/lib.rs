@@ -26,6 +26,7 @@ pub mod link;
 pub mod mounting;
 pub mod probe;
 pub mod profiles;
+mod resolve;
 mod touch;
 
 pub use error::DeviceError;
@@ -88,7 +89,7 @@ pub struct Options {
     pub protocol: Protocol,
     /// touch, forcedimension: the vendor's shared object; `None`: where the system finds it
     pub library: Option<PathBuf>,
-    /// touch: configuration name; inverse3: device id; `None`: the first
+    /// touch: configuration name; inverse3: device id; forcedimension: number, from 0 on; `None`: the first
     pub device: Option<String>,
     /// from the device's frame to the patient's
     pub mounting: Mounting,

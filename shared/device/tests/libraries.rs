@@ -356,8 +356,8 @@ fn contact_through_a_device_fades_when_it_is_unplugged_and_rises_when_it_is_back
     let (mut pressed, mut resting) = (0.0, 0);
     for _ in 0..5000 {
         let f = tick(&mut device, &mut core, 0.1 + 1e-9);
-        // the coupling goes with the mean age of the poses, which a busy machine moves
-        resting = if f > 0.5 && (f - pressed).abs() < 2e-3 { resting + 1 } else { 0 };
+        // the coupling goes with the mean age of the poses, which a busy machine moves by some per cent
+        resting = if f > 0.5 && (f - pressed).abs() < 0.02 { resting + 1 } else { 0 };
         pressed = f;
         if resting > 100 {
             break;
@@ -421,4 +421,19 @@ fn kinds_are_named_as_scenes_write_them() {
         assert_eq!(Kind::named(kind.name()), Some(kind));
     }
     assert_eq!(Kind::named("mouse"), None);
+}
+
+/// libdhd numbers the devices that are plugged in; the stand-in has one.
+#[test]
+fn the_second_device_is_not_the_first() {
+    let library = built("dhd", "second");
+    let named = |id: &str| Options { library: Some(library.clone()), device: Some(id.into()), ..Options::default() };
+    let mut first = open(Kind::ForceDimension, &named("0")).unwrap();
+    assert!(ticks(&mut first, 5.0, [0.0; 3], |d| d.status() == DeviceStatus::Connected));
+    drop(first);
+    let mut second = open(Kind::ForceDimension, &named("1")).unwrap();
+    assert!(!ticks(&mut second, 0.3, [0.0; 3], |d| d.status() == DeviceStatus::Connected), "there is no second");
+    for no_number in ["left", "-1", "1.0", "", "128"] {
+        assert!(matches!(usable(Kind::ForceDimension, &named(no_number)), Err(DeviceError::NoNumber { .. })), "{no_number}");
+    }
 }

@@ -15,6 +15,10 @@ pub enum DeviceTip {
     Rigid,
 }
 
+/// Lever of a hand that holds a needle by its handle [mm], made up: no device tells of its damping against turns, so that it is taken as what that against
+/// motion makes at this lever.
+pub const GRIP_MM: f64 = 40.0;
+
 /// What stays the same from tick to tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NeedleConfig {
@@ -28,9 +32,11 @@ pub struct NeedleConfig {
     pub grip_n_mm_per_rad: f64,
     /// largest stiffness that the device renders passively [N/mm]: of the grip across the needle, and of all that is elastic along it together
     pub device_n_per_mm: f64,
+    /// largest stiffness against turns that the device renders passively [N·mm/rad]
+    pub device_n_mm_per_rad: f64,
     /// largest change of friction [N/s]; the paper limits it per frame
     pub friction_slew_n_per_s: f64,
-    /// largest force given out [N]
+    /// largest force given out [N]; what takes more is not cut
     pub max_force_n: f64,
     /// largest torque given out [N·mm]
     pub max_torque_n_mm: f64,
@@ -50,6 +56,7 @@ impl NeedleConfig {
             grip_n_mm_per_rad: 3_000.0,
             // T/2 and 2 ms of delay on a device of 5 N·s/m
             device_n_per_mm: 2.0,
+            device_n_mm_per_rad: 2.0 * GRIP_MM * GRIP_MM,
             friction_slew_n_per_s: 100.0,
             max_force_n: 3.3,
             max_torque_n_mm: 150.0,
@@ -68,6 +75,7 @@ impl NeedleConfig {
         check("grip_n_per_mm", c.grip_n_per_mm, "1e-3 to 1e5", (1e-3..=1e5).contains(&c.grip_n_per_mm))?;
         check("grip_n_mm_per_rad", c.grip_n_mm_per_rad, "1 to 1e9", (1.0..=1e9).contains(&c.grip_n_mm_per_rad))?;
         check("device_n_per_mm", c.device_n_per_mm, "1e-2 to 1e6", (1e-2..=1e6).contains(&c.device_n_per_mm))?;
+        check("device_n_mm_per_rad", c.device_n_mm_per_rad, "1 to 1e9", (1.0..=1e9).contains(&c.device_n_mm_per_rad))?;
         check("friction_slew_n_per_s", c.friction_slew_n_per_s, "0.1 to 1e6", (0.1..=1e6).contains(&c.friction_slew_n_per_s))?;
         check("max_force_n", c.max_force_n, "0 to 100", (0.0..=100.0).contains(&c.max_force_n))?;
         check("max_torque_n_mm", c.max_torque_n_mm, "0 to 1e4", (0.0..=1e4).contains(&c.max_torque_n_mm))?;

@@ -1,5 +1,7 @@
 //! What happened to the tip in a tick.
 
+use crate::PathNode;
+
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EventKind {
@@ -9,6 +11,8 @@ pub enum EventKind {
     Puncture,
     /// the needle left the patient
     Withdrawn,
+    /// the tip is in a tissue that it was not seen to cut its way to: the needle began inside, jumped, or moved while nobody looked
+    Found,
 }
 
 /// Something that happened to the tip, for the report.
@@ -22,6 +26,13 @@ pub struct Event {
     pub reference_mm: [f64; 3],
     /// path cut so far, in reference space [mm]
     pub depth_mm: f64,
-    /// force at the tip just before [N]
+    /// force at the tip just before [N]: of a tissue that was cut its threshold (eq. 4), less what had relaxed
     pub force_n: f64,
+}
+
+impl Event {
+    /// The needle has left the patient; where its path had ended.
+    pub(crate) fn withdrawn(tip: &PathNode) -> Self {
+        Self { kind: EventKind::Withdrawn, material: tip.material, reference_mm: tip.reference.into(), depth_mm: 0.0, force_n: 0.0 }
+    }
 }

@@ -23,7 +23,7 @@ mod tick;
 pub mod tissue;
 
 pub use breathing::{AtRest, Breathing};
-pub use config::{DeviceTip, NeedleConfig};
+pub use config::{DeviceTip, GRIP_MM, NeedleConfig};
 pub use error::NeedleError;
 pub use events::{Event, EventKind};
 pub use gauge::Gauge;

@@ -25,3 +25,5 @@ pub const MAX_STEP_S: f64 = 0.1;
 /// Part of what a device can hold along the needle that is the tip's; friction has what is left of the whole. Neither shall vanish: a tip is felt as it is
 /// (1.2 N/mm in liver) on a device of 1.6 N/mm.
 pub const TIP_SHARE: f64 = 0.75;
+/// Part of the device's largest force that friction along a path may take: the rest draws a needle out against it.
+pub const FRICTION_SHARE: f64 = 0.75;

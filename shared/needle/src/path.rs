@@ -51,6 +51,8 @@ pub struct Path {
     layer: Option<(f64, f64)>,
     /// part of Δd that the present tissue's spring does not see [mm]
     preload_mm: f64,
+    /// the surface has given way
+    entered: bool,
 }
 
 impl Path {
@@ -58,7 +60,7 @@ impl Path {
     pub(crate) fn new(spacing_mm: f64, length_mm: f64) -> Self {
         // neighbours may be half a spacing apart; breathing may stretch a path by half
         let room = ((3.0 * length_mm / spacing_mm) as usize + 8).min(crate::limits::MAX_PATH_NODES);
-        Self { nodes: Vec::with_capacity(room), spacing_mm, layer: None, preload_mm: 0.0 }
+        Self { nodes: Vec::with_capacity(room), spacing_mm, layer: None, preload_mm: 0.0, entered: false }
     }
 
     /// Nodes from the skin to the tip.
@@ -99,6 +101,14 @@ impl Path {
         self.nodes.clear();
         self.layer = None;
         self.preload_mm = 0.0;
+        self.entered = false;
+    }
+
+    /// A path that nothing cut, in this tissue: the first point on the skin, the last the tip. None of them has moved along the needle.
+    pub(crate) fn lay(&mut self, points: impl Iterator<Item = (V3, u8)>) {
+        self.clear();
+        self.nodes.extend(points.map(|(reference, material)| PathNode { reference, material, slip_mm: 0.0 }).take(self.nodes.capacity()));
+        self.entered = true;
     }
 
     /// First contact with the skin.
@@ -126,15 +136,24 @@ impl Path {
         self.layer = table.get(material).capsule.map(|c| (c.cutting_force_n, c.thickness_mm));
     }
 
-    /// Moves the tip for a device that is Δd ahead along d (unit vector); returns how far it went [mm], negative for back.
-    pub(crate) fn follow<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
+    /// Moves the tip for a device that is Δd ahead along d (unit vector); returns how far it went [mm], negative for back. `fresh` is what relaxation has
+    /// left of the tip's force.
+    pub(crate) fn follow<T: Tissue + ?Sized>(
+        &mut self,
+        delta_mm: f64,
+        d: V3,
+        fresh: f64,
+        tissue: &T,
+        table: &MaterialTable,
+        told: &mut Told,
+    ) -> f64 {
         if self.nodes.is_empty() || !delta_mm.is_finite() || delta_mm == 0.0 {
             return 0.0;
         }
-        if delta_mm < 0.0 { -self.retract(-delta_mm, tissue, told) } else { self.cut(delta_mm, d, tissue, table, told) }
+        if delta_mm < 0.0 { -self.retract(-delta_mm, tissue, told) } else { self.cut(delta_mm, d, fresh, tissue, table, told) }
     }
 
-    fn cut<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
+    fn cut<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, fresh: f64, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
         // a device that came back gives the spring its whole length again
         self.preload_mm = self.preload_mm.min(delta_mm);
         let look = LOOK_MM.max(delta_mm / (MAX_LOOKS / 2) as f64);
@@ -154,10 +173,11 @@ impl Path {
                 material: tip.material,
                 reference_mm: at.into(),
                 depth_mm: depth,
-                force_n: force,
+                // on its way through this tick's Δd the tip passed its threshold: more than that it never had
+                force_n: threshold * fresh,
             };
             if self.layer.is_some_and(|(_, thickness)| thickness <= 0.0) {
-                self.layer = None;
+                (self.layer, self.entered) = (None, true);
                 tell(told, told_here(self.length_mm(), tip.reference));
                 continue;
             }
@@ -171,6 +191,11 @@ impl Path {
             if l == 0 {
                 // p_1 stays on the skin
                 self.nodes.push(tip);
+            }
+            if self.layer.is_none() && !self.entered {
+                // a surface without a layer of its own
+                self.entered = true;
+                tell(told, told_here(0.0, tip.reference));
             }
             let l = self.nodes.len() - 1;
             self.nodes[l].reference = to;
@@ -189,7 +214,7 @@ impl Path {
                 let spring = left - self.preload_mm;
                 self.preload_mm = (left - table.get(found).deflection_mm(material.tip_force_n(spring))).clamp(0.0, left);
             } else if within == step {
-                self.layer = None;
+                (self.layer, self.entered) = (None, true);
                 tell(told, told_here(self.length_mm(), to));
             }
             self.place_nodes();
@@ -223,16 +248,7 @@ impl Path {
             let l = self.nodes.len() - 1;
             let tip = self.nodes[l];
             if l == 0 {
-                tell(
-                    told,
-                    Event {
-                        kind: EventKind::Withdrawn,
-                        material: tip.material,
-                        reference_mm: tip.reference.into(),
-                        depth_mm: 0.0,
-                        force_n: 0.0,
-                    },
-                );
+                tell(told, Event::withdrawn(&tip));
                 self.clear();
                 return by_mm;
             }

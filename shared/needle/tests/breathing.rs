@@ -111,8 +111,8 @@ fn what_moves_the_tip_of_a_free_needle_in_its_tissue_is_its_own_stiffness_and_fr
                 "{depth} mm deep, {name}: tip off its tissue {across:.4} mm across, {along:.1e} along, ahead {ahead:.4}; travels {bare:.4} mm a breath at rest, {drawn:.4} with what it is ahead"
             );
         }
-        // along, nothing drags behind
-        assert!(whole[1] < 1e-3, "{whole:?}");
+        // along, nothing drags behind but what of the path's springs is along a needle that is not quite parallel to its path
+        assert!(whole[1] < 3e-3, "{whole:?}");
         // friction against the tip's spring is what pushes the tip ahead; a straight needle in a bowed channel is what pulls it aside
         assert!(no_friction[2] < 1e-6 && (no_friction[0] - whole[0]).abs() < 1e-3, "{whole:?} {no_friction:?}");
         assert!(

@@ -45,7 +45,7 @@ struct Swung {
 
 /// A needle held at a depth and pushed at 20 mm/s sideways and 30 mm/s along, for 3 s.
 fn swing<B: Breathing>(hand: Hand, device_n_per_mm: f64, material: Material, depth: f64, breathing: impl Fn(f64) -> B) -> Swung {
-    let mut tool = with(NeedleConfig { max_force_n: 100.0, max_torque_n_mm: 1e4, device_n_per_mm, ..config() }, material);
+    let mut tool = with(NeedleConfig { max_force_n: 3.3, max_torque_n_mm: 150.0, device_n_per_mm, ..config() }, material);
     for n in 0..4000 {
         tick(&mut tool, straight(depth * f64::from(n) / 3999.0), &breathing(0.0), &half_space);
     }

@@ -13,20 +13,25 @@ use crate::{
 /// Coverage falls from 1 to 0 between these distances [pixels].
 const LINE: [f64; 2] = [0.4, 1.2];
 
-/// Where lines are, how densely, and in which colour.
+/// Part of a line in a pixel: how much of the pixel, and in which colour.
+struct Mark {
+    at: u32,
+    cover: f32,
+    color: [f32; 3],
+}
+
+/// Where lines are: memory and time go with their length, not with the picture.
 struct Ink {
     width: usize,
     height: usize,
-    cover: Vec<f32>,
-    color: Vec<[f32; 3]>,
+    marks: Vec<Mark>,
 }
 
 impl Ink {
     fn put(&mut self, x: usize, y: usize, distance: f64, color: [f32; 3]) {
         let cover = ((LINE[1] - distance) / (LINE[1] - LINE[0])).clamp(0.0, 1.0) as f32;
-        let at = y * self.width + x;
-        if cover > self.cover[at] {
-            (self.cover[at], self.color[at]) = (cover, color);
+        if cover > 0.0 {
+            self.marks.push(Mark { at: (y * self.width + x) as u32, cover, color });
         }
     }
 
@@ -66,7 +71,7 @@ pub(crate) fn outlines(geometry: &Geometry<'_>, section: &Section, picture: &mut
         let pixel = |axis: [f64; 3], n: usize| dot(from, axis) / section.mm_per_pixel + (n as f64 - 1.0) / 2.0;
         ([pixel(right, width), pixel(down, height)], dot(from, normal))
     };
-    let mut ink = Ink { width, height, cover: vec![0.0; width * height], color: vec![[0.0; 3]; width * height] };
+    let mut ink = Ink { width, height, marks: Vec::new() };
     for mesh in geometry.meshes {
         let placed: Vec<([f64; 2], f64)> = mesh.positions.iter().map(|p| place(p.map(f64::from))).collect();
         for t in mesh.triangles {
@@ -107,8 +112,11 @@ pub(crate) fn outlines(geometry: &Geometry<'_>, section: &Section, picture: &mut
             }
         }
     }
-    for (pixel, (cover, color)) in picture.rgb.chunks_exact_mut(3).zip(ink.cover.iter().zip(&ink.color)) {
-        for (byte, c) in pixel.iter_mut().zip(color) {
+    // of those that cover a pixel alike the first, as they were drawn
+    ink.marks.sort_by(|a, b| a.at.cmp(&b.at).then(b.cover.total_cmp(&a.cover)));
+    ink.marks.dedup_by_key(|mark| mark.at);
+    for Mark { at, cover, color } in ink.marks {
+        for (byte, c) in picture.rgb[3 * at as usize..][..3].iter_mut().zip(color) {
             *byte = (f32::from(*byte) + (255.0 * c - f32::from(*byte)) * cover + 0.5) as u8;
         }
     }

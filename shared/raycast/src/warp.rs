@@ -21,6 +21,7 @@ mod exact;
 mod field;
 mod lattice;
 mod led;
+pub mod pitch;
 mod reference;
 mod rough;
 mod settle;

@@ -252,6 +252,12 @@ impl Scene {
         Some(named.unwrap_or(recording::FILE).into())
     }
 
+    /// Number of the organ that is shown alone, from 1; 0 shows the whole patient.
+    pub fn organ_alone(&self) -> u64 {
+        let alone = self.rendering.alone.as_ref();
+        alone.and_then(|name| self.organs.iter().position(|organ| organ.name == *name)).map_or(0, |n| n as u64 + 1)
+    }
+
     /// The surface that is felt.
     pub fn touched_surface(&self) -> TouchedSurface {
         match self.haptic.surface {

@@ -94,7 +94,7 @@ pub struct DeviceSection {
     /// touch, forcedimension: the vendor's shared object; by default where the system finds it
     #[serde(skip_serializing_if = "Option::is_none")]
     pub library: Option<PathBuf>,
-    /// touch: configuration name; inverse3: device id; by default the first
+    /// touch: configuration name; inverse3: device id; forcedimension: number, from "0" on; by default the first
     #[serde(skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
     /// what it can do, by name: Touch, Premium 6DOF, omega, delta.3, sigma.7, Inverse3; by default the usual one of its kind. For device `"external"`: with a

@@ -21,6 +21,8 @@ export class Picture {
     on("window-center", "input", (e) => ({ window_center_hu: e.valueAsNumber }));
     on("window-width", "input", (e) => ({ window_width_hu: e.valueAsNumber }));
     on("follow", "change", (e) => ({ sections_follow_tool: e.checked }));
+    // an organ alone is shown as a volume: a surface at one value has none
+    on("organ-alone", "change", (e) => (+e.value ? { organ_alone: +e.value, mode: 0 } : { organ_alone: 0 }));
     // effects that the scene lets be switched, as the server names them
     $("effects").addEventListener("change", (e) => {
       this.switched[e.target.name] = performance.now();
@@ -32,6 +34,8 @@ export class Picture {
   hello(model) {
     this.mouse.hello(model);
     $("camera-tip").disabled = $("follow").disabled = !model.facts.has_tool;
+    $("organs").hidden = model.facts.organs.length === 0;
+    $("organ-alone").replaceChildren(...["the whole patient", ...model.facts.organs].map((name, n) => new Option(n ? `${name} alone` : name, n)));
   }
 
   state({ view, state }) {
@@ -41,6 +45,7 @@ export class Picture {
     press("mode-volume", view.mode === 0); press("mode-surface", view.mode === 1);
     press("camera-free", view.camera === 0); press("camera-tip", view.camera === 1);
     const put = (id, value) => { if (document.activeElement !== $(id) || $(id).type === "range") $(id).value = value; };
+    put("organ-alone", view.organ_alone);
     put("threshold", view.threshold_hu); put("threshold-number", Math.round(view.threshold_hu));
     put("window-center", view.window_center_hu); put("window-width", view.window_width_hu);
     $("window-center-now").textContent = `${view.window_center_hu.toFixed(0)} HU`;

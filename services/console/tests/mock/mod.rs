@@ -75,6 +75,7 @@ impl Mock {
             panels: vec!["3d", "axial", "coronal", "sagittal", "force", "threshold", "incision", "breathing"],
             has_tool: true,
             incises: true,
+            organs: vec!["skull".into(), "brain".into()],
             breathing: Some("synthetic".into()),
         };
         let mut view = default_view(LOW, HIGH);

@@ -1,6 +1,6 @@
 //! Rays through breathing tissue: how exactly the field is inverted for a frame.
 //!
-//! The field is one wave of shear, whose inverse is known by formula, given to the ray caster on 96³ nodes (which is itself wrong by at most
+//! The field is one wave of shear, whose inverse is known by formula, given to the ray caster on 128³ nodes (which is itself wrong by at most
 //! 0.007 mm). Of the lattice the error is the distance of the rest positions that rays are sent to from the true ones, and `largest` the bound that the
 //! ray caster itself computes for the frame.
 
@@ -12,7 +12,8 @@ use crate::{
 };
 use maille_phantom::Kind;
 use maille_raycast::{
-    Camera, Extras, Motion, Picture, Preset, Settings, Skip, Warp, WarpOptions, WarpReport, WarpScheme, render, render_extra, resampled,
+    Camera, Extras, Motion, Picture, Preset, Settings, Skip, Warp, WarpOptions, WarpScheme, render, render_extra, resampled,
+    warp::pitch::{PITCHES_MM, Tried, cheapest},
 };
 use maille_testkit::{Displacement as _, SinusoidalShear, sample_displacement};
 use maille_volume::{BrickSource, Grid};
@@ -48,8 +49,8 @@ pub(super) static CURVES: &[Curve] = &[
         truth: "the inverse by formula of a wave of shear",
         timed: "the frame's inverse, and the frame",
         theory: Theory::Not(
-            "the lattice is made finer until the frame's bound is within the tolerance: tolerances that one pitch serves differ in their rays only, and \
-             the given field itself is wrong by up to 0.007 mm",
+            "the lattice is as coarse as costs a frame least, and what it cannot do is found one by one: tolerances that one pitch serves differ in their rays and \
+             in those places only, and the given field itself is wrong by up to 0.007 mm",
         ),
         bench: |c| {
             // as the rendering service shares a tolerance out: 0.66 of it are the rays'
@@ -74,31 +75,25 @@ pub(super) static CURVES: &[Curve] = &[
     },
 ];
 
-/// Pitches tried for a tolerance [mm], coarse to fine.
-const PITCHES: [f32; 6] = [16.0, 12.0, 8.0, 6.0, 4.0, 2.0];
-
 /// Where the lattice's pitch comes from.
 #[derive(Clone, Copy, PartialEq)]
 enum Pitch {
     /// as the setting says
     Given,
-    /// as coarse as the setting's tolerance allows
+    /// that whose frames cost least within the setting's tolerance
     Sought,
-}
-
-/// How far from where it is anything is drawn by the lattice [mm], as the rendering service reckons: the residual itself, and what a picture's own lattice adds.
-fn drawn_off_mm(report: &WarpReport, view_mm: f32) -> f32 {
-    report.lattice_mm + view_mm
 }
 
 const SHEAR: SinusoidalShear =
     SinusoidalShear { normal: [1.0, 0.0, 0.0], along: [0.0, 0.6, 0.8], amplitude: 10.0, wavelength: 200.0, phase: 0.4 };
 
-/// The wave on nodes over a volume.
+/// The wave on nodes over a volume and what comes near it: where the field ends it has a kink, which is another matter.
 fn wave(grid: &Grid) -> Result<Motion, TradeoffError> {
-    let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64);
-    let mut nodes = Grid::axis_aligned([96; 3], extent.map(|e| e / 95.0));
-    (nodes.origin, nodes.direction) = (grid.origin, grid.direction);
+    const AROUND_MM: f64 = 40.0;
+    let extent: [f64; 3] = std::array::from_fn(|c| grid.spacing[c] * (grid.size[c] - 1) as f64 + 2.0 * AROUND_MM);
+    let mut nodes = Grid::axis_aligned([128; 3], extent.map(|e| e / 127.0));
+    nodes.direction = grid.direction;
+    nodes.origin = grid.world_from_index(grid.spacing.map(|mm| -AROUND_MM / mm));
     Motion::new(&[sample_displacement(&nodes, &SHEAR)]).map_err(|e| TradeoffError::Bench("raycast", e.to_string()))
 }
 
@@ -167,14 +162,15 @@ fn bench(context: &Context, pitch: Pitch, options: &[(f32, WarpOptions)]) -> Res
         let mut warp = Warp::new(volume.info(), options);
         let mut report = warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
         if pitch == Pitch::Sought {
-            for pitch_mm in PITCHES {
-                options.pitch_mm = pitch_mm;
-                warp = Warp::new(volume.info(), options);
-                report = warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
-                if drawn_off_mm(&report, 0.5 * options.tolerance_mm) <= value {
-                    break;
-                }
+            // as the rendering service does
+            let mut tried = Vec::new();
+            for pitch_mm in PITCHES_MM {
+                let found = Warp::new(volume.info(), WarpOptions { pitch_mm, ..options }).update(volume.info(), &motion, &[1.0]);
+                tried.push(Tried::of(pitch_mm, [found.map_err(|e| fail(&e))?]));
             }
+            options.pitch_mm = cheapest(&tried, options.tolerance_mm);
+            warp = Warp::new(volume.info(), options);
+            report = warp.update(volume.info(), &motion, &[1.0]).map_err(|e| fail(&e))?;
         }
         let places = (1..=4000u32).map(|n| [0.754_877_7, 0.569_840_3, 0.362_154_8].map(|a: f64| 0.15 + 0.7 * (f64::from(n) * a).fract()));
         let errors = mean_and_worst(places.map(|share| {

@@ -10,9 +10,9 @@ static STATE: Mutex<State> = Mutex::new(State { plugged: true, open: false, enab
 fn there() -> c_int { let s = STATE.lock().unwrap(); if s.plugged && s.open { 0 } else { -1 } }
 
 #[unsafe(no_mangle)] pub extern "C" fn dhdGetDeviceCount() -> c_int { c_int::from(STATE.lock().unwrap().plugged) }
-#[unsafe(no_mangle)] pub extern "C" fn dhdOpenID(_index: c_char) -> c_int {
+#[unsafe(no_mangle)] pub extern "C" fn dhdOpenID(index: c_char) -> c_int {
     let mut s = STATE.lock().unwrap();
-    if s.plugged { s.open = true; 3 } else { -1 }
+    if s.plugged && index == 0 { s.open = true; 3 } else { -1 }
 }
 #[unsafe(no_mangle)] pub extern "C" fn dhdClose(_id: c_char) -> c_int { STATE.lock().unwrap().open = false; 0 }
 #[unsafe(no_mangle)] pub unsafe extern "C" fn dhdGetPosition(x: *mut c_double, y: *mut c_double, z: *mut c_double, id: c_char) -> c_int {

@@ -13,6 +13,8 @@ use super::cycles::{Cycle, find_cycles};
 use super::filter::LowPass;
 use super::trace::{SignalError, Trace, quantile};
 use crate::breath::{Breath, Breathing};
+use serde::Serialize;
+use std::fmt;
 
 /// How a recording is prepared.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,7 +32,7 @@ impl Default for Conditioning {
 }
 
 /// What was made of a recording.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct RecordedReport {
     /// breaths found in the whole recording
     pub breaths: usize,
@@ -38,8 +40,12 @@ pub struct RecordedReport {
     pub period_s: f64,
     /// end of expiration and of inspiration, medians [the file's unit]
     pub ends: [f64; 2],
+    /// length of the whole recording [s]
+    pub duration_s: f64,
     /// length of what is played before it repeats [s]
     pub loop_s: f64,
+    /// rows of the file that are played
+    pub rows: usize,
     /// stretches without a measurement, longer than three sampling periods
     pub gaps: usize,
     /// the longest of them [s]
@@ -48,6 +54,19 @@ pub struct RecordedReport {
     pub rows_left_out: usize,
     /// how late the filter is [s]
     pub delay_s: f64,
+}
+
+impl fmt::Display for RecordedReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} breaths of {:.1} s in {:.0} s, ", self.breaths, self.period_s, self.duration_s)?;
+        match self.gaps {
+            0 => write!(f, "no gaps")?,
+            1 => write!(f, "one gap of {:.1} s", self.longest_gap_s)?,
+            n => write!(f, "{n} gaps, the longest {:.1} s", self.longest_gap_s)?,
+        }
+        let (left_out, all) = (self.rows_left_out, self.rows + self.rows_left_out);
+        write!(f, ", {left_out} of {all} rows left out; {:.2} s late by its filter, repeats after {:.0} s", self.delay_s, self.loop_s)
+    }
 }
 
 /// A recording that plays for ever.
@@ -118,7 +137,9 @@ impl Recorded {
             breaths: cycles.len(),
             period_s: period,
             ends: [sign * ee, sign * ei],
+            duration_s: trace.duration_s(),
             loop_s: length as f64 * STEP_S,
+            rows: trace.values.len(),
             gaps: gaps.len(),
             longest_gap_s: gaps.iter().map(|g| g.1).fold(0.0, f64::max),
             rows_left_out: trace.dropped_rows + trace.outlier_rows,
@@ -204,6 +225,8 @@ mod tests {
         let torn = whole.enumerate().filter(|(n, _)| n % 250 >= 50).map(|(n, t)| (t, if n % 199 == 0 { 0.0 } else { breathing(t) }));
         let torn = Recorded::new(&Trace::new("torn", torn).unwrap(), &Conditioning::default()).unwrap();
         assert!(torn.report().gaps >= 7 && torn.report().rows_left_out > 0, "{:?}", torn.report());
+        let said = torn.report().to_string();
+        assert!(said.contains(&format!("{} gaps", torn.report().gaps)) && said.contains("rows left out"), "{said}");
         let (clean, patched) = (largest_steps(&full), largest_steps(&torn));
         // in a millisecond: nothing beyond what the whole signal does, up to the slope a bridged hole may have
         assert!(patched.0 < 1.5 * clean.0 && patched.1 < 3.0 * clean.1, "{clean:?} {patched:?}");

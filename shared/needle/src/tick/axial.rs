@@ -6,10 +6,13 @@
 //! (`tests/port.rs`). Here the springs give more, k·σ with σ ≤ 1 such that tip and friction together are no stiffer than
 //! [`NeedleConfig::device_n_per_mm`](crate::NeedleConfig); Δx_i may then be R/(k·σ), and friction itself stays R. The tip's own spring is limited to
 //! [`TIP_SHARE`] of it.
+//!
+//! **What a device can overcome.** Friction of a path as a whole is held to [`FRICTION_SHARE`] of the largest force, by ρ ≤ 1 before each R: a needle that a
+//! hand could push in and never draw out again would be stuck.
 
 use super::NeedleTool;
 use crate::AIR;
-use crate::limits::TIP_SHARE;
+use crate::limits::{FRICTION_SHARE, TIP_SHARE};
 
 /// Cutting over this length makes relaxed tissue fresh [mm].
 const FRESH_MM: f64 = 1.0;
@@ -17,7 +20,7 @@ const FRESH_MM: f64 = 1.0;
 const SETTLE_S: f64 = 0.02;
 
 impl NeedleTool {
-    /// Energy stored in needle, grip and tissue's springs [N·mm]; loads along the needle are no part of it.
+    /// Energy stored in needle, grip, the hand's hold and tissue's springs [N·mm]; loads along the needle are no part of it.
     pub fn stored_n_mm(&self) -> f64 {
         let mut energy = self.rod.elastic_n_mm();
         let nodes = self.path.nodes();
@@ -29,12 +32,18 @@ impl NeedleTool {
         for (i, node) in nodes.iter().enumerate().skip(1) {
             energy += 0.5 * self.friction_stiffness(i) * node.slip_mm * node.slip_mm;
         }
-        energy
+        energy + if nodes.is_empty() { 0.0 } else { self.held_off_n_mm() }
     }
 
-    /// σ for the path as it is.
+    /// σ and ρ for the path as it is.
     pub(super) fn soften(&mut self) {
-        self.softened = 1.0;
+        (self.softened, self.smoothed) = (1.0, 1.0);
+        let nodes = self.path.nodes();
+        let most: f64 = (1..nodes.len()).map(|i| self.table.get(nodes[i].material).friction_n * self.piece(i)).sum();
+        let overcome = FRICTION_SHARE * self.config.max_force_n;
+        if most > overcome {
+            self.smoothed = overcome / most;
+        }
         let friction: f64 = (1..self.path.nodes().len()).map(|i| self.friction_stiffness(i)).sum();
         let tip = *self.path.tip().map_or(self.table.get(AIR), |t| self.table.get(t.material));
         let slope = tip.a1_n_per_mm + 2.0 * tip.a2_n_per_mm2 * (self.ahead_mm - self.path.preload_mm()).max(0.0);
@@ -53,7 +62,7 @@ impl NeedleTool {
             }
             let moved = self.arc.get(i).map_or(0.0, |before| now - before);
             let material = *self.table.get(self.path.nodes()[i].material);
-            let most = material.friction_n / (material.stiffness_n_per_mm * self.softened);
+            let most = self.smoothed * material.friction_n / (material.stiffness_n_per_mm * self.softened);
             let node = &mut self.path.nodes_mut()[i];
             node.slip_mm = (node.slip_mm + forward - moved).clamp(-most, most);
         }
@@ -61,9 +70,13 @@ impl NeedleTool {
 
     /// σ·k_i·‖p_i − p_{i−1}‖/Δp [N/mm] of eq. 7.
     pub(super) fn friction_stiffness(&self, i: usize) -> f64 {
+        self.softened * self.table.get(self.path.nodes()[i].material).stiffness_n_per_mm * self.piece(i)
+    }
+
+    /// ‖p_i − p_{i−1}‖/Δp
+    fn piece(&self, i: usize) -> f64 {
         let nodes = self.path.nodes();
-        let piece = (nodes[i].reference - nodes[i - 1].reference).norm() / self.path.spacing_mm();
-        self.softened * self.table.get(nodes[i].material).stiffness_n_per_mm * piece
+        (nodes[i].reference - nodes[i - 1].reference).norm() / self.path.spacing_mm()
     }
 
     /// Eq. 7 before its limit [N].

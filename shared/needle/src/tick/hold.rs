@@ -69,7 +69,6 @@ impl NeedleTool {
             }
             let node = self.path.nodes()[i];
             let material = self.table.get(node.material);
-            let tangent = self.rod.tangent(arc);
             let is_tip = i + 1 == count;
             let piece = |a: usize, b: usize| (self.path.nodes()[a].reference - self.path.nodes()[b].reference).norm();
             let before = if i > 0 { piece(i, i - 1) } else { 0.0 };
@@ -78,7 +77,9 @@ impl NeedleTool {
                 M3::identity() * material.stiffness_n_per_mm
             } else {
                 let share = 0.5 * (before + after) / self.path.spacing_mm();
-                (M3::identity() - tangent * tangent.transpose()) * (material.stiffness_n_per_mm * share)
+                let along = self.world[i + 1] - self.world[i.saturating_sub(1)];
+                let along = along.try_normalize(1e-6).unwrap_or_else(|| self.rod.tangent(arc));
+                (M3::identity() - along * along.transpose()) * (material.stiffness_n_per_mm * share)
             };
             self.rod.attach(Attachment::spring(arc, self.world[i], stiffness));
         }

@@ -9,13 +9,19 @@
 //! L − |b − s|, measured from the skin along the path ([`DeviceTip::AlongNeedle`]). For a straight needle both are the same;
 //! [`DeviceTip::Rigid`] is the paper's.
 //!
-//! **Forces on the handle.** Cutting (5) against the tip's direction in world; friction (7) against the shaft's; base (8): what the compliant grip
-//! holds of the rod's base across the insertion direction d_1 (the vector v − (v·d_1)d_1; the paper's print lacks the second d_1). Torque: the
+//! **Forces on the handle.** Cutting (5), friction (7) and base (8): what the compliant grip holds of the rod's base across the insertion direction d_1 (the
+//! vector v − (v·d_1)d_1; the paper's print lacks the second d_1); for their directions see `give`. Torque: the
 //! rotational spring between handle and needle, its part about the axis set to zero. Cutting and friction go to the hand directly, as in the paper:
 //! they do not bow the rod, so that a thin needle does not buckle under what it pushes.
 //!
-//! **Between rod and tissue**: a spring per path node at the needle's arc length there, k_j times the path it stands for, across the needle; at
-//! the tip in all directions. Outside the body the needle is free: tissue that moves tilts it about the skin (lever).
+//! **Between rod and tissue**: a spring per path node at the needle's arc length there, k_j times the path it stands for, across the path; at
+//! the tip in all directions. (The paper has it across the needle. That differs by the square of the angle between both; but a spring that turns with what it
+//! holds is the gradient of nothing.) Outside the body the needle is free: tissue that moves tilts it about the skin (lever).
+//!
+//! **Limits** of force and torque are those of the hand's hold on the needle, which gives way at them; see `slip`.
+//!
+//! **Where the needle was not led** (`anew`: it begins inside, jumps, or moved while nobody looked) nothing was cut: the path is laid along the needle as it
+//! is there, without punctures and without force, and told as found inside; see `skin`.
 //!
 //! **Let go** (`held = false`): nothing holds the base; the rod is carried by tissue, neither cuts nor slides at its tip, pushes itself back until
 //! friction and the tip's spring balance, and the handle is where its base is. The rod's drag is then against the tissue at its tip, not against the world:
@@ -24,7 +30,7 @@
 //! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre.
 //!
 //! Units: mm, N, N·mm, s; frame: world, where not said otherwise. Degraded modes: a pose that is not finite or whose quaternion is none → the last
-//! one stands, counted; jumps are counted and change nothing (no force exceeds the limit); a path that is full stops the tip's nodes, not
+//! one stands, counted; jumps are counted, and the path is laid anew; a path that is full stops the tip's nodes, not
 //! the needle. Cost: 10–20 µs with 25 nodes. Allocation: none. Not here: slew limits and fading (`maille-contact`), where tissue comes from.
 
 mod axial;
@@ -32,19 +38,18 @@ mod drag;
 mod give;
 mod hold;
 mod skin;
+mod slip;
 
 use crate::breathing::Sound;
 use crate::config::{DeviceTip, NeedleConfig};
 use crate::error::NeedleError;
+use crate::events::Event;
 use crate::limits::MAX_STEP_S;
-use crate::path::{Path, Told};
+use crate::path::{Path, Told, tell};
 use crate::ports::{Faults, HandlePose, Inputs, Outputs};
 use crate::rod::{Rod, Solved};
 use crate::{AIR, Breathing, M3, MaterialTable, Q, Tissue, V3};
-use nalgebra::Quaternion;
-
-/// A move of the device by more than this in one tick is a jump [mm].
-const MAX_JUMP_MM: f64 = 10.0;
+use slip::Hold;
 
 /// A needle on a device; see the module.
 #[derive(Clone, Debug)]
@@ -57,9 +62,13 @@ pub struct NeedleTool {
     world: Vec<V3>,
     /// arc length of the proxies from the skin at the end of the last tick [mm]
     arc: Vec<f64>,
+    /// the handle that the needle is on: the hand's, but for what it gave way
     position: V3,
     orientation: Q,
+    hold: Hold,
     seen: bool,
+    /// distance from handle to point of the unloaded needle, by node [mm]; none where it is straight
+    chords: Vec<f64>,
     /// device's tip in reference space: where the next inversion begins
     reference: V3,
     /// length of needle inside, as the hand has it, at the last tick [mm]
@@ -72,6 +81,8 @@ pub struct NeedleTool {
     relaxed: f64,
     /// σ of the friction springs, see `axial`
     softened: f64,
+    /// ρ of their limits, see `axial`
+    smoothed: f64,
     /// friction given out last [N]
     friction_n: f64,
     faults: Faults,
@@ -95,14 +106,21 @@ impl NeedleTool {
         let c = &config;
         let path = Path::new(c.path_spacing_mm, c.rod.length_mm);
         let room = path.capacity();
+        let rod = Rod::with_rest(c.rod, room + 2, curvature)?;
+        let base = rod.nodes()[0];
+        let chords: Vec<f64> = rod.nodes().iter().map(|x| (x - base).norm()).collect();
+        let segment = c.rod.length_mm / (c.rod.nodes - 1) as f64;
+        let straight = chords.iter().enumerate().all(|(i, chord)| (chord - i as f64 * segment).abs() < 1e-9);
         Ok(Self {
-            rod: Rod::with_rest(c.rod, room + 2, curvature)?,
+            rod,
+            chords: if straight { Vec::new() } else { chords },
             path,
             table: table.no_stiffer_than(crate::limits::TIP_SHARE * c.device_n_per_mm, c.max_force_n),
             world: Vec::with_capacity(room),
             arc: Vec::with_capacity(room),
             position: V3::zeros(),
             orientation: Q::identity(),
+            hold: Hold::new(),
             seen: false,
             reference: V3::zeros(),
             inserted_mm: None,
@@ -110,9 +128,14 @@ impl NeedleTool {
             carried: None,
             relaxed: 0.0,
             softened: 1.0,
+            smoothed: 1.0,
             friction_n: 0.0,
             faults: Faults::default(),
-            config: NeedleConfig { grip_n_per_mm: c.grip_n_per_mm.min(c.device_n_per_mm), ..config },
+            config: NeedleConfig {
+                grip_n_per_mm: c.grip_n_per_mm.min(c.device_n_per_mm),
+                grip_n_mm_per_rad: c.grip_n_mm_per_rad.min(c.device_n_mm_per_rad),
+                ..config
+            },
         })
     }
 
@@ -148,9 +171,17 @@ impl NeedleTool {
         let inputs = &Inputs { dt_s: inputs.dt_s, handle: inputs.handle, held: inputs.held, breathing: &sound, tissue: inputs.tissue };
         let dt = if inputs.dt_s.is_finite() { inputs.dt_s.clamp(1e-6, MAX_STEP_S) } else { 1e-3 };
         let held = inputs.held || self.path.nodes().is_empty();
-        self.accept(&inputs.handle, held);
+        let anew = self.accept(&inputs.handle, held, inputs.dt_s);
+        let left = self.path.tip().copied().filter(|_| anew);
+        if left.is_some() {
+            self.path.clear();
+            self.leave();
+        }
         if self.path.nodes().is_empty() {
-            self.look_for_skin(inputs, &mut told);
+            self.look_for_skin(inputs, anew, &mut told);
+        }
+        if let (Some(tip), true) = (left, self.path.nodes().is_empty()) {
+            tell(&mut told, Event::withdrawn(&tip));
         }
         let mut out = self.outside();
         if !self.path.nodes().is_empty() {
@@ -162,23 +193,6 @@ impl NeedleTool {
         self.faults.invalid_breathing += u64::from(sound.wrong() > 0);
         out.faults = self.faults;
         out
-    }
-
-    /// Takes the device's pose, or keeps the last that could be believed.
-    fn accept(&mut self, pose: &HandlePose, held: bool) {
-        let position = V3::from(pose.position_mm);
-        let [x, y, z, w] = pose.orientation_xyzw;
-        let q = Quaternion::new(w, x, y, z);
-        let length = q.norm();
-        let valid = position.iter().all(|v| v.is_finite() && v.abs() < 1e6) && length.is_finite() && length > 1e-9;
-        if !valid {
-            self.faults.invalid_poses += 1;
-        } else if held {
-            self.faults.jumps += u64::from(self.seen && (position - self.position).norm() > MAX_JUMP_MM);
-            self.position = position;
-            self.orientation = Q::new_unchecked(q / length);
-            self.seen = true;
-        }
     }
 
     /// What a needle gives that nothing holds.
@@ -203,6 +217,30 @@ impl NeedleTool {
         }
     }
 
+    /// Length of needle between handle and skin [mm]: |b − s|, or of a needle with a rest shape what of it reaches so far.
+    fn outside_mm(&self, skin: V3) -> f64 {
+        self.reach((self.position - skin).norm()).0
+    }
+
+    /// The direction from skin to handle, and how much more needle is outside for each millimetre that the handle goes there.
+    fn outwards(&self, skin: V3) -> (V3, f64) {
+        let away = self.position - skin;
+        (away.try_normalize(1e-9).unwrap_or_else(|| -self.insertion()), self.reach(away.norm()).1)
+    }
+
+    /// Length of unloaded needle that reaches so far from the handle [mm], and its slope.
+    fn reach(&self, away: f64) -> (f64, f64) {
+        let length = self.config.rod.length_mm;
+        let Some(i) = self.chords.windows(2).position(|c| c[1] >= away) else {
+            // straight, or further away than its tip
+            return (away + self.chords.last().map_or(0.0, |chord| length - chord), 1.0);
+        };
+        let segment = length / (self.config.rod.nodes - 1) as f64;
+        let (low, high) = (self.chords[i], self.chords[i + 1]);
+        let slope = segment / (high - low).max(1e-3 * segment);
+        (segment * i as f64 + (away - low).max(0.0) * slope, slope)
+    }
+
     fn inside<B: Breathing + ?Sized, T: Tissue + ?Sized>(
         &mut self,
         inputs: &Inputs<'_, B, T>,
@@ -215,7 +253,7 @@ impl NeedleTool {
         // arc lengths of the last tick, then those of this one: what tissue did along the needle
         let skin = self.carry(inputs.breathing);
         let axis = self.rod.tip_tangent();
-        let inserted = if held { length - (self.position - skin).norm() } else { self.arc_of_tip() + self.ahead_mm };
+        let inserted = if held { length - self.outside_mm(skin) } else { self.arc_of_tip() + self.ahead_mm };
         let forward = inserted - self.inserted_mm.unwrap_or(inserted);
         self.soften();
         self.rub(forward);
@@ -231,7 +269,7 @@ impl NeedleTool {
             };
             self.reference = inputs.breathing.to_reference(device.into(), (tip + direction * ahead).into()).into();
             ahead = (self.reference - tip).dot(&direction);
-            let went = self.path.follow(ahead, direction, inputs.tissue, &self.table, told);
+            let went = self.path.follow(ahead, direction, self.fresh(), inputs.tissue, &self.table, told);
             if self.path.nodes().is_empty() {
                 self.leave();
                 *out = self.outside();
@@ -249,7 +287,7 @@ impl NeedleTool {
         let skin = self.carry(inputs.breathing);
         self.store_arcs();
         self.soften();
-        self.inserted_mm = Some(if held { length - (self.position - skin).norm() } else { self.arc_of_tip() + ahead });
+        self.inserted_mm = Some(if held { length - self.outside_mm(skin) } else { self.arc_of_tip() + ahead });
         let (cutting, friction) = self.axial(dt);
         self.go_along(held);
         out.solved = self.solve(held, dt);

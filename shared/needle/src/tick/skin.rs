@@ -1,21 +1,35 @@
-//! The way in and out: the needle in the air, first contact with the skin, withdrawal.
+//! The way in and out: the needle in the air, first contact with the skin, a needle that is found inside, withdrawal.
+//!
+//! A tip that comes into tissue within one tick lies on its skin: back along the needle to where it is outside, the first node is there. A needle that was
+//! not led there lies in a path that nobody saw cut. Its nodes are laid along the needle's own shape, carried to rest, a spacing apart from skin to tip;
+//! its springs are at rest, no layer stands before it, and the tissue of its tip is told, not what lies between.
 
-use super::{NeedleTool, to_reference_direction};
+use super::{NeedleTool, slip::MAX_JUMP_MM};
 use crate::events::{Event, EventKind};
-use crate::limits::{MAX_SKIN_HALVINGS, MAX_SKIN_STEPS};
+use crate::limits::{MAX_PATH_NODES, MAX_SKIN_HALVINGS, MAX_SKIN_STEPS};
 use crate::path::{Told, tell};
 use crate::ports::Inputs;
-use crate::{AIR, Breathing, Tissue};
+use crate::{AIR, Breathing, Tissue, V3};
+
+/// A needle that was not led is found inside where its tip is deeper than this [mm]; else it touches the skin.
+const TOUCH_MM: f64 = 1.0;
 
 impl NeedleTool {
     /// Needle in the air: its rest shape on the handle. First contact with the skin makes the first path node.
-    pub(super) fn look_for_skin<B: Breathing + ?Sized, T: Tissue + ?Sized>(&mut self, inputs: &Inputs<'_, B, T>, told: &mut Told) {
+    pub(super) fn look_for_skin<B: Breathing + ?Sized, T: Tissue + ?Sized>(
+        &mut self,
+        inputs: &Inputs<'_, B, T>,
+        anew: bool,
+        told: &mut Told,
+    ) {
+        self.in_air();
         self.rod.lay(self.position, self.orientation);
         (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed) = (None, 0.0, 0.0, 0.0);
         if !self.seen {
             return;
         }
-        let tip = self.rod.nodes()[self.rod.nodes().len() - 1];
+        let length = self.config.rod.length_mm;
+        let tip = self.rod.point(length);
         let guess = if self.reference.iter().all(|v| v.is_finite()) { self.reference } else { tip };
         self.reference = inputs.breathing.to_reference(tip.into(), guess.into()).into();
         let inside = inputs.tissue.material_at(self.reference.into());
@@ -23,16 +37,16 @@ impl NeedleTool {
             return;
         }
         // back along the needle to where it is outside
-        let Some(along) = to_reference_direction(inputs.breathing, self.reference, self.rod.tip_tangent()) else { return };
-        let length = self.config.rod.length_mm;
-        let (mut deep, mut found, mut back) = (0.0, None, 0.0);
+        let at_rest = |back: f64, guess: V3| V3::from(inputs.breathing.to_reference(self.rod.point(length - back).into(), guess.into()));
+        let (mut deep, mut found, mut back, mut at) = (0.0, None, 0.0, self.reference);
         let mut step: f64 = 0.25;
         for _ in 0..MAX_SKIN_STEPS {
             back += step;
             if back > length {
                 break;
             }
-            if inputs.tissue.material_at((self.reference - along * back).into()) == AIR {
+            at = at_rest(back, at);
+            if inputs.tissue.material_at(at.into()) == AIR {
                 found = Some(back);
                 break;
             }
@@ -46,16 +60,29 @@ impl NeedleTool {
         let mut skin = deep;
         for _ in 0..MAX_SKIN_HALVINGS {
             let middle = 0.5 * (skin + air);
-            if inputs.tissue.material_at((self.reference - along * middle).into()) == AIR { air = middle } else { skin = middle }
+            at = at_rest(middle, at);
+            if inputs.tissue.material_at(at.into()) == AIR { air = middle } else { skin = middle }
         }
-        let at = self.reference - along * skin;
+        let at = at_rest(skin, at);
         let material = inputs.tissue.material_at(at.into());
-        self.path.touch(at, material, &self.table);
-        tell(told, Event { kind: EventKind::Contact, material, reference_mm: at.into(), depth_mm: 0.0, force_n: 0.0 });
+        if skin <= TOUCH_MM || (!anew && skin <= MAX_JUMP_MM) {
+            self.path.touch(at, material, &self.table);
+            tell(told, Event { kind: EventKind::Contact, material, reference_mm: at.into(), depth_mm: 0.0, force_n: 0.0 });
+            return;
+        }
+        let pieces = ((skin / self.path.spacing_mm()).ceil() as usize).clamp(1, self.path.capacity().min(MAX_PATH_NODES) - 1);
+        let mut last = at;
+        self.path.lay((0..=pieces).map(|n| {
+            last = at_rest(skin * (1.0 - n as f64 / pieces as f64), last);
+            (last, inputs.tissue.material_at(last.into()))
+        }));
+        let depth_mm = self.path.length_mm();
+        tell(told, Event { kind: EventKind::Found, material: inside, reference_mm: self.reference.into(), depth_mm, force_n: 0.0 });
     }
 
     /// The needle has left the patient.
     pub(super) fn leave(&mut self) {
+        self.in_air();
         (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed, self.carried) = (None, 0.0, 0.0, 0.0, None);
         self.arc.clear();
         self.world.clear();
