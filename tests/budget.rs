@@ -86,7 +86,7 @@ fn what_moves_is_drawn_coarsely_and_what_rests_as_if_it_had_never_moved() {
     assert!(others > 0 && coarse > 0.5 * drawn, "while the tool moves, frames are coarse: {coarse} of {drawn}, {others} differ");
     assert!(coarse < drawn, "the last one is whole");
     assert_eq!(never_coarse, 0.0);
-    // a fraction of the pixels and twice the step: at the very least twice as fast, however busy the machine is
+    // a fraction of the pixels and longer steps: at the very least twice as fast, however busy the machine is
     assert!(2.0 * ms < never_ms, "{ms} {never_ms}");
     assert!(whole.iter().filter(|&&v| v > 40).count() > whole.len() / 20, "and it shows a head");
 }

@@ -63,8 +63,16 @@ fn every_figure_is_there_in_order_and_nothing_is_left() {
         .flat_map(|key| [(key, "polled"), (key, "blocking")]);
     let polled =
         ["clock_read", "commit_64_bricks", "commit_64_to_snapshot", "snapshot", "snapshot_while_committing"].map(|k| (k, "polled"));
-    let as_run =
-        ["run_tool_move_to_commit", "commit_to_frame", "tool_move_to_frame", "hand_to_tool_state", "hand_to_frame"].map(|k| (k, "as_run"));
+    let as_run = [
+        "run_tool_move_to_commit",
+        "commit_to_frame_begun",
+        "commit_to_frame",
+        "frame",
+        "tool_move_to_frame",
+        "hand_to_tool_state",
+        "hand_to_frame",
+    ]
+    .map(|k| (k, "as_run"));
     let figure = |key: &str, mode: &str, what: &str| {
         let value = &report["latency"][key][mode][what];
         value.as_f64().unwrap_or_else(|| panic!("{key}.{mode}.{what} is missing in {report:#}"))

@@ -17,8 +17,15 @@ use maille_transport::{ControlMap, Domain, FrameSubscriber, Node, Subscriber, mo
 use std::{collections::VecDeque, io::Write as _, time::Duration};
 
 /// What is found, in the report's words.
-pub(crate) const KEYS: [&str; 5] =
-    ["hand_to_tool_state", "hand_to_frame", "run_tool_move_to_commit", "commit_to_frame", "tool_move_to_frame"];
+pub(crate) const KEYS: [&str; 7] = [
+    "hand_to_tool_state",
+    "hand_to_frame",
+    "run_tool_move_to_commit",
+    "commit_to_frame_begun",
+    "commit_to_frame",
+    "frame",
+    "tool_move_to_frame",
+];
 /// Length of the plays [s]: quick, full.
 pub(crate) const STEPPING_S: [f64; 2] = [1.5, 6.0];
 pub(crate) const PRESSING_S: [f64; 2] = [1.5, 5.0];
@@ -163,7 +170,7 @@ impl Observer {
 
     fn press(&mut self, way: impl Fn(f64) -> [f64; 3], seconds: f64) -> Result<(), LatencyError> {
         let began = monotonic_ns();
-        let mut told = 0;
+        let (mut told, mut drawn) = (0, 0);
         // moves and commits whose answer has not been seen; a few dozen at most
         let mut moves: VecDeque<ToolMove> = VecDeque::new();
         let mut commits: VecDeque<(Commit, Option<u64>)> = VecDeque::new();
@@ -189,7 +196,13 @@ impl Observer {
             }
             if let Some(frame) = self.frames.latest() {
                 let (epoch, finished) = (frame.header().epoch, frame.header().stamp.time_ns);
+                let begun = finished.saturating_sub(frame.header().render_ns);
+                if frame.header().stamp.sequence != drawn {
+                    drawn = frame.header().stamp.sequence;
+                    tell("frame", frame.header().render_ns)?;
+                }
                 while let Some((commit, cause)) = commits.front().filter(|(c, _)| c.epoch <= epoch) {
+                    tell("commit_to_frame_begun", begun.saturating_sub(commit.stamp.time_ns))?;
                     tell("commit_to_frame", finished.saturating_sub(commit.stamp.time_ns))?;
                     if let Some(moved) = cause {
                         tell("tool_move_to_frame", finished.saturating_sub(*moved))?;

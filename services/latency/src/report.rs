@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use std::fmt;
 
 /// Keys of the report and what each measures.
-pub const KEYS: [(&str, &str); 18] = [
+pub const KEYS: [(&str, &str); 20] = [
     ("clock_read", "reading the clock; part of every figure"),
     ("iceoryx2_one_way", "256 bytes, publish to receive"),
     ("iceoryx2_round_trip", "256 bytes there and back"),
@@ -21,7 +21,9 @@ pub const KEYS: [(&str, &str); 18] = [
     ("snapshot", "snapshot() and its release"),
     ("snapshot_while_committing", "the same beside a writer that never rests"),
     ("run_tool_move_to_commit", "real run: the haptic tick to the commit"),
+    ("commit_to_frame_begun", "real run: commit to the beginning of that frame"),
     ("commit_to_frame", "real run: commit to the first finished frame that shows it"),
+    ("frame", "real run: time that a frame takes"),
     ("tool_move_to_frame", "real run: the haptic tick to that frame"),
     ("hand_to_tool_state", "real run: hand's command to a tick with the tool moved 0.05 mm"),
     ("hand_to_frame", "real run: hand's command to the arrival of a frame that shows that"),

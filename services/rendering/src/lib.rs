@@ -1,6 +1,6 @@
 //! The rendering process: the newest commit, ray-cast where it lies, out as frames.
 //!
-//! At the scene's rate it looks whether anything that is seen has changed (epoch, view, tool); if so it pins a snapshot, brings
+//! At the scene's rate, and earlier for a commit ([`beats`]), it looks whether anything that is seen has changed (epoch, view, tool); if so it pins a snapshot, brings
 //! the map of empty space up to date for the bricks whose versions changed, draws the views and publishes them as one
 //! loaned sample. The pin is held for one frame. While something changes, pixels and step of the 3D view hold the scene's rate
 //! ([`FrameBudget`], unless the scene says `adapt = false`); once nothing does, it is drawn whole, and what then stands goes out again twice
@@ -9,6 +9,7 @@
 #![forbid(unsafe_code)]
 
 mod backend;
+mod beats;
 mod breath;
 mod compose;
 mod departure;
@@ -24,6 +25,8 @@ mod overlay;
 #[doc(hidden)]
 pub mod turns;
 mod view;
+#[cfg(test)]
+mod wakes;
 
 use maille_contract::needle::{NeedleLog, NeedleState};
 use maille_contract::{FrameHeader, Role, ServiceCell, Switches, ToolState, control::Counter};
@@ -109,7 +112,10 @@ fn frames<W: Stopwatch + Send>(
     composer.meshes = pool.install(|| meshes::Meshes::of(scene, &reader.rest()))?;
     life.ready();
     let period_ns = (1e9 / scene.rendering.rate_hz) as u64;
-    let (mut next, mut sent, mut last_sent_ns) = (monotonic_ns(), 0u64, 0u64);
+    let mut beats = beats::Beats::new(period_ns, monotonic_ns());
+    // the epoch that was looked at last
+    let mut looked = None;
+    let (mut sent, mut last_sent_ns) = (0u64, 0u64);
     let mut budget = FrameBudget::new(period_ns as f64 * 1e-6);
     let (mut shown, mut header) = (None, FrameHeader::default());
     // whether the last beat drew: a loop that rests misses nothing
@@ -131,12 +137,21 @@ fn frames<W: Stopwatch + Send>(
         if !life.beat(now) {
             return Ok(());
         }
-        if now < next {
-            std::thread::sleep(NAP.min(Duration::from_nanos(next - now)));
+        let epoch = reader.epoch();
+        let fresh = looked.is_some_and(|looked| looked != epoch);
+        let due = beats.due_ns(fresh);
+        if now < due {
+            let nap = NAP.min(Duration::from_nanos(due - now));
+            // a commit that comes meanwhile is looked at, as soon as the rhythm has it; one that waits for that wakes nobody
+            if fresh {
+                std::thread::sleep(nap)
+            } else {
+                reader.wait_beyond(epoch, nap)
+            }
             continue;
         }
-        let missed = (now - next) / period_ns;
-        next += (missed + 1) * period_ns;
+        let missed = beats.look(now);
+        looked = Some(epoch);
         if !view.listen(life.control()) {
             life.cell().count(Counter::Refused, 1);
         }
@@ -170,7 +185,7 @@ fn frames<W: Stopwatch + Send>(
         let moment = breather.as_ref().map_or(0, |_| time_ns);
         let ends = tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())).zip(needle.map(|n| n.nodes_mm[0].map(|v| (v * 20.0).round())));
         let asked = (view.generation(), view.turns());
-        let seen = (reader.epoch(), asked, tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
+        let seen = (epoch, asked, tool.map(|t| t.tip_mm.map(|v| (v * 20.0).round())), ends, held, moment);
         let moving = shown != Some(seen);
         shown = Some(seen);
         let asked = if adapt { budget.next(moving) } else { moving.then_some(view.quality()) };
@@ -187,6 +202,7 @@ fn frames<W: Stopwatch + Send>(
             }
             continue;
         };
+        beats.draw();
         composer.quality = quality;
         let snapshot = reader.snapshot();
         if let Some(needle) = &needle {
@@ -208,6 +224,9 @@ fn frames<W: Stopwatch + Send>(
         });
         let render_ns = monotonic_ns() - now;
         let epoch = snapshot.epoch();
+        // a commit that came since the look is on this frame already
+        looked = Some(epoch);
+        shown = Some((epoch, seen.1, seen.2, seen.3, seen.4, seen.5));
         drop(snapshot);
         if let Err(reason) = drawn {
             // a view that cannot be drawn (a camera that looks nowhere) leaves the last picture standing until the scene's view is drawn

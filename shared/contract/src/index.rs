@@ -9,7 +9,7 @@ use bytemuck::Zeroable;
 use core::sync::atomic::{AtomicU32, AtomicU64};
 
 /// "mailidx" and the version of this layout.
-pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx4");
+pub const INDEX_MAGIC: u64 = u64::from_le_bytes(*b"mailidx5");
 /// Entries of a leaf page.
 pub const LEAF_LEN: usize = 64;
 /// Entry of something that does not exist.
@@ -97,12 +97,14 @@ pub struct IndexHeader {
     pub head: Head,
 }
 
-/// The head word with nothing beside it: readers load it at every snapshot and whenever they look for news. 128, because
-/// processors fetch lines in pairs.
+/// The head word with nothing beside it but what is written together with it: readers load it at every snapshot and whenever they look for news. 128,
+/// because processors fetch lines in pairs.
 #[repr(C, align(128))]
 pub struct Head {
     /// epoch << [`ROOT_BITS`] | root page: the one word that makes a commit visible
     pub word: AtomicU64,
+    /// one more with each commit, after the word: who waits for one sleeps on it (a futex, which has 32 bits)
+    pub bell: AtomicU32,
 }
 
 /// Life of a slot or page: [born, superseded) in epochs.

@@ -6,7 +6,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use maille_contract::{
     BreathLead, BreathState, Commit, ControlBlock, FrameHeader, KnobState, MotionHeader, OctreeHeader, ServiceCell, Stamp, Switches,
     ToolCommand, ToolMove, ToolState, UndoCommand, ViewState,
-    index::{Channel, ChannelLayout, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
+    index::{Channel, ChannelLayout, Head, IndexHeader, IndexLayout, RegionHeader, SlotRecord},
     messages::{DeviceForce, DeviceState, ViewRect},
     needle::{LabelsHeader, NeedleDrag, NeedleEvent, NeedleLog, NeedleState},
     probe::{Ping, Pong},
@@ -74,6 +74,7 @@ fn shared_words_keep_their_sizes_and_offsets() {
     golden!(SlotRecord, 16, born: 0, superseded: 8);
     golden!(IndexLayout, 384, brick: 0, size: 32, spacing: 56, origin: 80, direction: 104, rescale: 176, channels: 192, root_len: 360, root_count: 368, leaf_count: 376);
     assert_eq!((size_of::<IndexHeader>(), align_of::<IndexHeader>()), (640, 128));
+    assert_eq!((offset_of!(Head, word), offset_of!(Head, bell)), (0, 8));
     assert_eq!(
         (offset_of!(IndexHeader, magic), offset_of!(IndexHeader, checksum), offset_of!(IndexHeader, layout), offset_of!(IndexHeader, head)),
         (0, 8, 16, 512)

@@ -517,3 +517,44 @@ fn slabs_take_the_mean_or_the_largest_across_them() {
     assert!((seen(8.0, SlabMode::Mean) - seen(0.0, SlabMode::Mean)).abs() <= 1.0);
     assert!((seen(8.0, SlabMode::Maximum) - seen(0.0, SlabMode::Mean) - 40.0).abs() <= 1.0);
 }
+
+/// Opaque noisy matter by the longest steps of frames that have to be in time, against the picture by tenths of a voxel: where rays land deep in it the
+/// gradient is noise, and what is lit by that is dark wherever it points.
+#[test]
+fn no_speck_is_darker_than_the_matter_around_it_by_the_longest_steps_of_what_moves() {
+    let grid = Grid::axis_aligned([64; 3], [1.0; 3]);
+    let mut state = 7u64;
+    let noise: Vec<f64> = std::iter::repeat_with(|| {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        ((state >> 40) as f64 / (1u64 << 23) as f64 - 1.0) * 40.0
+    })
+    .take(grid.voxel_count())
+    .collect();
+    let source = BrickedVolume::from_volume(&volume(grid.clone(), |x| {
+        let inside = 22.0 - norm(x.map(|c| c - 31.5));
+        let [i, j, k] = x.map(|c| c.round() as usize);
+        (700.0 * inside - 200.0).clamp(-1000.0, 40.0) + if inside > -3.0 { noise[grid.offset(i, j, k)] } else { 0.0 }
+    }));
+    let camera = Camera { eye: [31.5, -100.0, 31.5], target: [31.5; 3], up: [0.0, 0.0, 1.0], fov_deg: 24.0 };
+    let by = |step, kernel| {
+        let settings = Settings { step: Step::Voxels(step), ..Settings::volume(crate::Preset::Skin.transfer()) };
+        look(&source, &camera, &settings, kernel, [200, 200])
+    };
+    let grey = |picture: &Picture, n: usize| picture.rgb[3 * n..][..3].iter().map(|&v| f64::from(v)).sum::<f64>() / 3.0;
+    let fine = by(0.1, Kernel::Fastest);
+    // the ball's face, not its rim, where rays only graze it
+    let aside = |n: usize| (2 * n).abs_diff(199).pow(2);
+    let face: Vec<usize> = (0..40_000).filter(|n| aside(n % 200) + aside(n / 200) < 120 * 120).collect();
+    let darkest = |step, kernel| {
+        let coarse = by(step, kernel);
+        face.iter().map(|&n| grey(&fine, n) - grey(&coarse, n)).fold(0.0, f64::max)
+    };
+    for (step, kernel) in
+        [(1.0, Kernel::Fastest), (crate::budget::LONGEST_STEP, Kernel::Fastest), (crate::budget::LONGEST_STEP, Kernel::Scalar)]
+    {
+        let darkest = darkest(step, kernel);
+        println!("{step} voxels, {kernel:?}: darker by {darkest:.1} of 255 at most");
+        assert!(darkest < 26.0, "{step} voxels, {kernel:?}: {darkest}");
+    }
+    assert!(darkest(2.0, Kernel::Fastest) > 28.0, "by longer ones there are some, so that this would be seen");
+}

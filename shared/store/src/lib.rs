@@ -29,6 +29,7 @@
 #![deny(unsafe_code)]
 
 mod audit;
+mod bell;
 mod channel;
 #[cfg_attr(not(feature = "fault-points"), allow(dead_code))]
 #[doc(hidden)]

@@ -6,6 +6,7 @@
 
 use crate::{
     Writer,
+    bell::ring,
     fault::{Broken, Point, broken, point},
     protocol::{Pinned, pinned, publish},
     transaction::{Edit, Version},
@@ -55,6 +56,7 @@ impl Writer {
         point(Point::BeforeHead);
         publish(self.index.head(), epoch, new_root);
         point(Point::AfterHead);
+        ring(self.index.bell());
         for (slot, bytes) in hidden.into_iter().flatten() {
             // at the pace of somebody who computes what he writes, not of a copy
             for (to, from) in self.slot_bytes_mut(0, slot).iter_mut().zip(bytes) {

@@ -2,6 +2,7 @@
 
 use crate::{
     BrickChannel, DISPLACEMENT_LEN, Displacement, STATE_BYTES, StoreError,
+    bell::sleep,
     channel::SPECS,
     fault::{Point, point},
     layout::first_entry,
@@ -18,6 +19,7 @@ use maille_volume::{Brick, BrickId, BrickLayout, BrickSource, VolumeInfo};
 use std::{
     ops::Range,
     sync::atomic::Ordering::{Acquire, Relaxed},
+    time::Duration,
 };
 
 /// A process's read-only view of the store.
@@ -102,6 +104,11 @@ impl Reader {
     /// The newest committed epoch.
     pub fn epoch(&self) -> u64 {
         epoch_of(self.index.head().load(Acquire))
+    }
+
+    /// Sleeps until there is another epoch than this one, at most so long; awake at once where there is one already. It may come back early.
+    pub fn wait_beyond(&self, epoch: u64, at_most: Duration) {
+        sleep(self.index.bell(), || self.epoch() != epoch, at_most);
     }
 
     /// Pins the newest epoch. Wait-free: at most as many steps as the reader has pins, whatever the writer does.

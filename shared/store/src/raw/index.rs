@@ -11,7 +11,7 @@ use maille_contract::{names::segment, segment_header::checksum};
 use maille_transport::{Access, Domain, Segment};
 use maille_volume::{BrickLayout, VolumeInfo};
 use std::sync::atomic::{
-    AtomicU64,
+    AtomicU32, AtomicU64,
     Ordering::{Acquire, Relaxed, Release},
 };
 
@@ -93,6 +93,12 @@ impl IndexMap {
     #[inline]
     pub fn head(&self) -> &AtomicU64 {
         &self.header().head.word
+    }
+
+    /// What who waits for a commit sleeps on.
+    #[inline]
+    pub fn bell(&self) -> &AtomicU32 {
+        &self.header().head.bell
     }
 
     /// Words of a root page: leaf page numbers.
