@@ -446,5 +446,20 @@ fn a_haptic_process_that_is_killed_goes_on_with_the_log_and_takes_the_needle_out
     let after = living.control.needle_log.load::<NeedleLog>().unwrap().0;
     assert!(after.count > before.count && after.events[..before.count as usize] == before.events[..before.count as usize]);
     living.end();
-    assert_eq!(report(&file)["needle"]["target_reached"], true);
+    let report = report(&file);
+    assert_eq!(report["needle"]["target_reached"], true);
+    let events = report["needle"]["events"].as_array().unwrap();
+    // found inside: nothing was punctured a second time
+    assert_eq!(events[before.count as usize]["what"], "found inside", "{events:#?}");
+    let liver = |what: &str| events.iter().filter(|e| e["what"] == what && e["tissue"] == "liver").count();
+    assert_eq!((liver("met"), liver("punctured")), (1, 1), "{events:#?}");
+    // no event tells more force than the hand was given, and that is what layers take: skin's 1.2 N
+    let forces: Vec<f64> = events.iter().filter_map(|e| e["force_n"].as_f64()).collect();
+    assert!(forces.len() == events.len() && forces.iter().all(|n| *n <= 1.2 + 1e-9), "{forces:?}");
+    // parts of the force are parts of what was given
+    let trace = |key: &str| -> Vec<f64> {
+        report["needle"]["trace"][key].as_array().unwrap().iter().filter_map(serde_json::Value::as_f64).collect()
+    };
+    let most = report["needle"]["peak_force_n"].as_f64().unwrap() + 0.05;
+    assert!(trace("cutting_n").iter().chain(&trace("friction_n")).all(|n| n.abs() <= most), "more than {most} N");
 }

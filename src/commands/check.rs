@@ -66,10 +66,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let report = |e: maille_scene::SceneError| Failure::Report(e.into());
-    let mut scene = Scene::open(args.scene.as_deref(), args.volume.as_deref()).map_err(report)?;
-    if let Some(motion) = &args.motion {
-        scene.use_motion(motion.clone()).map_err(report)?;
-    }
+    let scene = Scene::open_with(args.scene.as_deref(), args.volume.as_deref(), args.motion.as_deref()).map_err(report)?;
     super::vet::scene(&scene).map_err(Failure::Refused)?;
     let patient = Patient::of(&scene.volume.source())?;
     let grid = &patient.info().grid;
@@ -245,8 +242,11 @@ fn print_text(scene: &Scene, patient: &Patient, plan: &Plan, breath: Option<&Pre
         let (start, end) = ends(way);
         let device = String::from(tool.device.clone());
         say!(
-            "tool         sphere of {} mm moved by `{device}`, round of {:.1} s, from ({}) to ({}) mm",
-            tool.radius_mm,
+            "tool         {} moved by `{device}`, round of {:.1} s, from ({}) to ({}) mm",
+            match scene.has_effect("needle") {
+                true => format!("needle of {} gauge and {} mm", scene.needle.gauge, scene.needle.length_mm),
+                false => format!("sphere of {} mm", tool.radius_mm),
+            },
             way.period_s(),
             triple(start, 1),
             triple(end, 1)

@@ -113,6 +113,8 @@ pub(crate) struct NeedleStage {
     /// the deepest path has grown since it was taken down, and how deep it was then [mm]
     path_grew: bool,
     path_told_mm: f64,
+    /// this insertion's greatest depth [mm]
+    last_deepest_mm: f64,
 }
 
 /// How tissue is dragged along, with room to gather it in.
@@ -167,7 +169,7 @@ impl NeedleStage {
                 );
             }
         }
-        let tool = NeedleTool::new(config, MaterialTable::new(&materials).map_err(fail)?).map_err(fail)?;
+        let tool = NeedleTool::with_rest(config, MaterialTable::new(&materials).map_err(fail)?, bent(n)).map_err(fail)?;
         let has_labels = scene.volume.file.is_none() || scene.volume.labels.is_some();
         let labels = has_labels.then(|| Region::open(domain, LABELS_REGION, LABELS_KIND)).transpose()?;
         let partly = scene.volume.labels.is_some();
@@ -200,6 +202,7 @@ impl NeedleStage {
             faults: [0; 5],
             path_grew: false,
             path_told_mm: 0.0,
+            last_deepest_mm: 0.0,
         }))
     }
 
@@ -338,16 +341,25 @@ impl NeedleStage {
             let deepest = if out.depth_mm > log.deepest_mm { now } else { log.to_target_mm[2] };
             log.to_target_mm = [now, log.to_target_mm[1].min(now), deepest];
         }
-        if out.depth_mm > log.deepest_mm {
-            log.deepest_mm = out.depth_mm;
+        log.deepest_mm = log.deepest_mm.max(out.depth_mm);
+        if out.path_nodes == 0 {
+            // the next insertion has a path of its own
+            (self.last_deepest_mm, self.path_told_mm) = (0.0, 0.0);
+        }
+        if out.depth_mm > self.last_deepest_mm {
+            self.last_deepest_mm = out.depth_mm;
             self.path_grew = true;
         }
         // the path of that depth: taken down every so often, and before it is lost
         if self.path_grew
-            && (out.depth_mm > self.path_told_mm + 0.5 || out.depth_mm < log.deepest_mm || self.ticks.is_multiple_of(LOG_EVERY))
+            && out.path_nodes > 0
+            && (out.depth_mm > self.path_told_mm + 0.5 || out.depth_mm < self.last_deepest_mm || self.ticks.is_multiple_of(LOG_EVERY))
         {
-            (self.path_grew, self.path_told_mm) = (false, log.deepest_mm);
-            log.path_nodes = fill(&mut log.path_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
+            (self.path_grew, self.path_told_mm) = (false, self.last_deepest_mm);
+            log.last_nodes = fill(&mut log.last_mm, self.tool.path().nodes().iter().map(|n| n.reference), &mut self.path_reference) as u64;
+            if self.last_deepest_mm >= log.deepest_mm {
+                (log.path_nodes, log.path_mm) = (log.last_nodes, log.last_mm);
+            }
         }
         for event in out.events.iter().flatten() {
             log.take(NeedleEvent {
@@ -421,7 +433,7 @@ fn renders_n_per_mm(device: &DeviceProfile, period_s: f64) -> f64 {
 
 /// The scene's table as the needle wants it.
 fn config(n: &Needle, limits: &Limits) -> Result<(NeedleConfig, Gauge), maille_needle::NeedleError> {
-    let gauge = Gauge::of(n.gauge)?;
+    let gauge = Gauge::usual(n.gauge)?;
     let gauge = n.bending_n_mm2.map_or(gauge, |bending| gauge.with_bending(bending));
     let rod = RodParameters { nodes: n.nodes, ..RodParameters::new(&gauge, n.length_mm) };
     let config = NeedleConfig {
@@ -436,6 +448,12 @@ fn config(n: &Needle, limits: &Limits) -> Result<(NeedleConfig, Gauge), maille_n
     Ok((config, gauge))
 }
 
+/// The rest shape: straight as far as it is told, then an arc towards the needle's own x.
+fn bent(n: &Needle) -> impl Fn(f64) -> [f64; 3] + use<> {
+    let (from, curvature) = (n.bent_from_mm, n.bent_radius_mm.map_or(0.0, |radius| 1.0 / radius));
+    move |arc| [0.0, if arc >= from { curvature } else { 0.0 }, 0.0]
+}
+
 fn material(t: &NeedleTissue) -> Material {
     Material {
         stiffness_n_per_mm: t.stiffness_n_per_mm,
@@ -446,5 +464,51 @@ fn material(t: &NeedleTissue) -> Material {
         capsule: t.capsule_n.map(|force| Capsule { cutting_force_n: force, thickness_mm: t.capsule_mm }),
         relaxing: t.relaxing,
         relaxation_s: t.relaxation_s,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maille_contact::Limits;
+    use maille_needle::{AtRest, Rod};
+
+    /// The tip of this scene's needle, clamped at the origin along z, under a load along x [N].
+    fn tip(n: &Needle, load_n: f64) -> V3 {
+        let (config, _) = config(n, &Limits::default()).unwrap();
+        let mut rod = Rod::with_rest(config.rod, 1, bent(n)).unwrap();
+        rod.attach(maille_needle::Attachment::load(n.length_mm, V3::x() * load_n));
+        rod.solve(f64::INFINITY);
+        rod.nodes()[rod.nodes().len() - 1]
+    }
+
+    #[test]
+    fn sixteen_gauge_bends_as_it_was_measured_unless_the_scene_says_otherwise() {
+        let n = Needle { gauge: 16, ..Needle::default() };
+        // 150 mm: 12.5 mm at 0.5 N, 26.0 mm at 1 N [Fortmeier et al. 2015, section 2.3]; one stiffness fits both within 5 %
+        for (load, measured) in [(0.5, 12.5), (1.0, 26.0)] {
+            let found = tip(&n, load).x;
+            assert!((found / measured - 1.0).abs() < 0.05, "{load} N: {found} mm, measured {measured}");
+        }
+        let tube = Needle { bending_n_mm2: Some(52_990.0), ..n };
+        assert!((tip(&tube, 1.0).x - 20.8).abs() < 0.3, "{}", tip(&tube, 1.0).x);
+    }
+
+    #[test]
+    fn a_scenes_needle_is_pre_bent_towards_its_own_x() {
+        let n = Needle { length_mm: 150.0, bent_radius_mm: Some(120.0), bent_from_mm: 90.0, nodes: 50, ..Needle::default() };
+        let found = tip(&n, 0.0);
+        // straight for 90 mm, then an arc of 60 mm
+        let (sin, cos) = (60.0f64 / 120.0).sin_cos();
+        let expected = V3::new(120.0 * (1.0 - cos), 0.0, 90.0 + 120.0 * sin);
+        assert!((found - expected).norm() < 0.5, "{found} {expected}");
+        // in tissue it goes along its arc: nothing pushes back aside while it lies as it is
+        let materials = [material(&NeedleTissue::default())];
+        let (config, _) = config(&n, &Limits::default()).unwrap();
+        let mut tool = NeedleTool::with_rest(config, MaterialTable::new(&materials).unwrap(), bent(&n)).unwrap();
+        let handle = HandlePose { position_mm: [0.0, 0.0, -70.0], orientation_xyzw: [0.0, 0.0, 0.0, 1.0] };
+        let tissue = |x: [f64; 3]| u8::from(x[2] >= 0.0);
+        let out = tool.tick(&Inputs { dt_s: 1e-3, handle, held: true, breathing: &AtRest, tissue: &tissue });
+        assert!(out.path_nodes > 8 && V3::from(out.force_n).norm() < 0.05, "{} nodes, {:?}", out.path_nodes, out.force_n);
     }
 }

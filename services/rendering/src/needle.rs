@@ -1,7 +1,7 @@
 //! The needle as bodies of the views: capsules along its nodes, and the path that it cut left behind it.
 //!
 //! The needle lies in the world, where haptic has it; its path lies in the patient at rest and is carried to where that patient lies in the picture.
-//! The deepest path of the run stays to be seen, thinner, when the needle has gone back. A picture is of the moment of the needle's tick ([`moment`]),
+//! The deepest path of the run and that of the last insertion stay to be seen, thinner, when the needle has gone back. A picture is of the moment of the needle's tick ([`moment`]),
 //! so that hand and picture show one needle in one breath, however late the picture is drawn.
 
 use maille_contract::needle::{NEEDLE_NODES, NeedleLog, NeedleState};
@@ -23,7 +23,7 @@ pub(crate) fn moment(needle: Option<&NeedleState>, now_ns: u64) -> u64 {
     needle.map(|needle| needle.time_ns).filter(|at| at.abs_diff(now_ns) <= SEEN_NS).unwrap_or(now_ns)
 }
 
-/// Capsules of a needle, its path and the deepest path of the run, into room that is kept.
+/// Capsules of a needle, its path, the deepest path of the run and the last insertion's, into room that is kept.
 pub(crate) fn bodies(needle: &NeedleState, log: Option<&NeedleLog>, to_world: impl Fn([f64; 3]) -> [f64; 3], room: &mut Vec<Capsule>) {
     room.clear();
     let Some(needle) = needle.checked() else { return };
@@ -39,10 +39,14 @@ pub(crate) fn bodies(needle: &NeedleState, log: Option<&NeedleLog>, to_world: im
     for piece in path.windows(2) {
         room.push(Capsule { a: to_world(wide(piece[0])), b: to_world(wide(piece[1])), radius: 0.5 * radius, color: PATH });
     }
-    let left = log.map_or(&[][..], |log| &log.path_mm[..(log.path_nodes as usize).min(NEEDLE_NODES)]);
-    let left = if left.iter().flatten().all(|v| v.is_finite()) { left } else { &[] };
-    for piece in left.windows(2) {
-        room.push(Capsule { a: to_world(wide(piece[0])), b: to_world(wide(piece[1])), radius: 0.4 * radius, color: LEFT });
+    let Some(log) = log else { return };
+    let deepest = &log.path_mm[..(log.path_nodes as usize).min(NEEDLE_NODES)];
+    let last = &log.last_mm[..(log.last_nodes as usize).min(NEEDLE_NODES)];
+    for left in [deepest, if last == deepest { &[] } else { last }] {
+        let left = if left.iter().flatten().all(|v| v.is_finite()) { left } else { &[] };
+        for piece in left.windows(2) {
+            room.push(Capsule { a: to_world(wide(piece[0])), b: to_world(wide(piece[1])), radius: 0.4 * radius, color: LEFT });
+        }
     }
 }
 
@@ -69,6 +73,14 @@ mod tests {
         (log.path_nodes, log.path_mm[1]) = (2, [0.0, 0.0, 9.0]);
         bodies(&needle, Some(&log), |p| [p[0] + 7.0, p[1], p[2]], &mut room);
         assert_eq!((room.len(), room[2].b, room[2].color), (3, [7.0, 0.0, 9.0], LEFT));
+        // and that of a second, shallower insertion; one path is not drawn twice
+        (log.last_nodes, log.last_mm) = (log.path_nodes, log.path_mm);
+        bodies(&needle, Some(&log), |p| p, &mut room);
+        assert_eq!(room.len(), 3);
+        log.last_mm[1] = [3.0, 0.0, 4.0];
+        bodies(&needle, Some(&log), |p| p, &mut room);
+        assert_eq!((room.len(), room[3].b), (4, [3.0, 0.0, 4.0]));
+        log.last_nodes = 0;
         log.path_mm[0][1] = f32::INFINITY;
         bodies(&needle, Some(&log), |p| p, &mut room);
         assert_eq!(room.len(), 2);

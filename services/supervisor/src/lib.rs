@@ -113,15 +113,12 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     if let Some(path) = &options.report {
         check_writable(path)?;
     }
-    let mut scene = Scene::open(options.scene.as_deref(), options.volume.as_deref())?;
+    let mut scene = Scene::open_with(options.scene.as_deref(), options.volume.as_deref(), options.motion.as_deref())?;
     if let Some(device) = &options.device {
         scene.use_device(device.clone())?;
     }
     if let Some(file) = &options.record {
         scene.use_recording(file)?;
-    }
-    if let Some(motion) = &options.motion {
-        scene.use_motion(motion.clone())?;
     }
     if let Some(vet) = options.vet {
         vet(&scene).map_err(SupervisorError::Refused)?;

@@ -56,6 +56,8 @@ pub struct NeedleReport {
     pub events: Vec<Touched>,
     pub events_not_kept: u64,
     pub path_mm: Vec<[f32; 3]>,
+    /// of the last insertion, where it was deepest
+    pub last_path_mm: Vec<[f32; 3]>,
     /// forces over time
     pub trace: TraceReport,
 }
@@ -127,6 +129,7 @@ impl NeedleReport {
             events,
             events_not_kept: log.count - kept as u64,
             path_mm: log.path_mm[..(log.path_nodes as usize).min(log.path_mm.len())].to_vec(),
+            last_path_mm: log.last_mm[..(log.last_nodes as usize).min(log.last_mm.len())].to_vec(),
             trace: trace.map(Trace::report).unwrap_or_default(),
         })
     }

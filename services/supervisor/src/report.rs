@@ -37,7 +37,7 @@
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |
 //! | `governor` | with `accuracy = "auto"`: `fronts` where they come from, `ladder` what could be given up, in order, `turns` (time, knob, value, loop, whether accuracy was given up, load), `given_up` what stood so at the end |
-//! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (at the end; null when the needle is out, `withdrawn`), `closest_to_target_mm` and `deepest_to_target_mm` (where the path was deepest) in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` and `residual_mm` of the rod in all `ticks_inside`, `ticks_slowed` and `ticks_unconverged` of them, `faults`, `port_energy_mj` and `port_energy_least_mj` (what the hand put in, less what it got back), `trace` (forces over time, see `trace.rs`; plotted beside the report), `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest |
+//! | `needle` | in a scene with one: `inside_s`, `deepest_mm`, `tip_to_target_mm` (at the end; null when the needle is out, `withdrawn`), `closest_to_target_mm` and `deepest_to_target_mm` (where the path was deepest) in the patient at rest, `target_reached`, `forbidden_touched`, `peak_force_n`, `peak_torque_n_mm`, `worst_residual_mm` and `residual_mm` of the rod in all `ticks_inside`, `ticks_slowed` and `ticks_unconverged` of them, `faults`, `port_energy_mj` and `port_energy_least_mj` (what the hand put in, less what it got back), `trace` (forces over time, see `trace.rs`; plotted beside the report), `events` (what, tissue, time, depth, force at the tip, place, `breath_phase`: 0 end of inspiration), `path_mm` the deepest path at rest and `last_path_mm` that of the last insertion |
 //! | `recording` | in a scene that is recorded: `file`, `moments` (lines), `fault` (why it is not whole) |
 //! | `store.spare_slots`, `spare_slots_low` | spare brick slots at the start; fewest ever free, null when none was ever taken |
 
@@ -475,6 +475,9 @@ impl fmt::Display for RunReport {
                     "  {:>7.2} s  {:>6.1} mm  {} {}{forbidden} by {:.2} N{phase}",
                     e.time_s, e.depth_mm, e.what, e.tissue, e.force_n
                 )?;
+            }
+            if n.events_not_kept > 0 {
+                writeln!(f, "  {} more, before the last, are not kept: what was touched is told of all", n.events_not_kept)?;
             }
         }
         if let Some(g) = &self.governor {

@@ -141,6 +141,10 @@ pub struct NeedleLog {
     pub path_mm: [[f32; 3]; NEEDLE_NODES],
     /// what happened
     pub events: [NeedleEvent; NEEDLE_EVENTS],
+    /// nodes in use of `last_mm`
+    pub last_nodes: u64,
+    /// the last insertion's path where that was deepest, reference
+    pub last_mm: [[f32; 3]; NEEDLE_NODES],
 }
 
 impl NeedleLog {

@@ -62,8 +62,8 @@ fn shared_words_keep_their_sizes_and_offsets() {
     golden!(NeedleState, 1_648, time_ns: 0, nodes: 8, path_nodes: 16, tissue: 24, radius_mm: 32, depth_mm: 40, ahead_mm: 48, parts_n: 56, torque_n_mm: 80, residual_mm: 104,
         nodes_mm: 112, path_mm: 880);
     golden!(NeedleEvent, 72, time_ns: 0, kind: 8, tissue: 16, reference_mm: 24, depth_mm: 48, force_n: 56, phase: 64);
-    golden!(NeedleLog, 4_392, count: 0, touched: 8, ticks_inside: 16, inside_ns: 24, peaks: 32, residual_mm: 48, to_target_mm: 56, slowed: 80, faults: 96,
-        port_mj: 136, deepest_mm: 152, path_nodes: 160, path_mm: 168, events: 936);
+    golden!(NeedleLog, 5_168, count: 0, touched: 8, ticks_inside: 16, inside_ns: 24, peaks: 32, residual_mm: 48, to_target_mm: 56, slowed: 80, faults: 96,
+        port_mj: 136, deepest_mm: 152, path_nodes: 160, path_mm: 168, events: 936, last_nodes: 4_392, last_mm: 4_400);
     golden!(NeedleDrag, 1_560, time_ns: 0, count: 8, radius_mm: 16, path_mm: 24, by_mm: 792);
     golden!(MotionHeader, 16, bytes: 0, storage_error_mm: 8);
     golden!(OctreeHeader, 16, bytes: 0, tolerance_hu: 8);

@@ -1,8 +1,9 @@
 //! Needles by gauge: bending and torsional stiffness from geometry, or as measured.
 //!
 //! EI = E·π/64·(D⁴ − d⁴), GJ = E/(1 + ν)·π/64·(D⁴ − d⁴) for a tube of outer diameter D and bore d. Steel: E = 200 GPa, ν = 0.3.
-//! Diameters: the usual regular-wall sizes of ISO 9626 needle tubing [mm]. A real needle is a cannula with a stylet inside, so that what was
-//! measured goes before geometry ([`Gauge::with_bending`]). For the 16 gauge needle of Fortmeier et al. 2015, section 2.3 (150 mm, 12.5 mm at
+//! Diameters: the Birmingham (Stubs iron wire) gauge of hypodermic tubing with its regular wall, thousandths of an inch told in millimetres. (ISO 9626 names
+//! tubing by metric sizes, 3.4 mm for 10 gauge to 0.18 mm for 34 gauge, which lie near these and are not these.) A real needle is a cannula with a stylet
+//! inside, so that what was measured goes before geometry ([`Gauge::usual`], [`Gauge::with_bending`]). For the 16 gauge needle of Fortmeier et al. 2015, section 2.3 (150 mm, 12.5 mm at
 //! 0.5 N, 26.0 mm at 1.0 N) the best single EI is [`MEASURED_16G_N_MM2`]: a clamped elastic rod stiffens with load and the data soften, so that
 //! about 3 % stay on either side.
 
@@ -52,6 +53,15 @@ impl Gauge {
         Ok(Self::tube(outer, bore, STEEL_N_PER_MM2))
     }
 
+    /// The needle of this gauge as it was measured, where that is published: 16 gauge, [`MEASURED_16G_N_MM2`]. The others are steel tubes.
+    ///
+    /// # Errors
+    /// When there is no such gauge in the table.
+    pub fn usual(gauge: u32) -> Result<Self, NeedleError> {
+        let tube = Self::of(gauge)?;
+        Ok(if gauge == 16 { tube.with_bending(MEASURED_16G_N_MM2) } else { tube })
+    }
+
     /// A tube of these diameters [mm] and Young's modulus [N/mm²].
     pub fn tube(outer_mm: f64, bore_mm: f64, young_n_per_mm2: f64) -> Self {
         let second_moment = std::f64::consts::PI / 64.0 * (outer_mm.powi(4) - bore_mm.powi(4));
@@ -78,6 +88,11 @@ mod tests {
             let found = Gauge::of(gauge).unwrap().bending_n_mm2;
             assert!((found - expected).abs() < half_digit, "{gauge}G: {found}");
         }
+        // measured goes before geometry, where it is published
+        let (measured, tube) = (Gauge::usual(16).unwrap(), Gauge::of(16).unwrap());
+        assert_eq!(measured.bending_n_mm2, MEASURED_16G_N_MM2);
+        assert!((measured.torsion_n_mm2 / measured.bending_n_mm2 - tube.torsion_n_mm2 / tube.bending_n_mm2).abs() < 1e-12);
+        assert_eq!(Gauge::usual(18), Gauge::of(18));
         assert_eq!(Gauge::of(13), Err(NeedleError::UnknownGauge(13)));
     }
 }

@@ -149,3 +149,14 @@ fn a_pre_bent_needle_is_found_along_its_own_arc_in_breathing_tissue() {
         assert!(off < 0.06, "{off} mm beside the needle");
     }
 }
+
+/// An inverse is good to a micrometre, and which one depends on its guess: what is met is tissue all the same.
+#[test]
+fn the_skin_is_never_met_as_air_whatever_the_inverse_rounds_to() {
+    for n in 0..200 {
+        let (mut tool, breath) = (tool(), Breath::new(12.0).at(0.02 * f64::from(n)));
+        let told: Vec<Event> =
+            (0..60).flat_map(|k| events(&tick(&mut tool, straight(-6.0 + 0.4 * f64::from(k)), &breath, &layers))).collect();
+        assert!(told[0].kind == EventKind::Contact && told[0].material == 1, "{n}: {:?}", told[0]);
+    }
+}

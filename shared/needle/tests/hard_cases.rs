@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Breath, DT, LENGTH, Random, config, half_space, needle, straight, tick, with};
+use common::{Breath, DT, LENGTH, Random, abdomen, config, half_space, needle, straight, tick, with};
 use maille_needle::{
     AtRest, Attachment, Breathing, Gauge, Grip, HandlePose, Inputs, M3, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q, Rod,
     RodParameters, V3,
@@ -50,7 +50,7 @@ fn three_to_two_hundred_nodes() {
     for nodes in [0, 1, 2, 257, 100_000] {
         let mut c = config();
         c.rod.nodes = nodes;
-        assert!(NeedleTool::new(c, MaterialTable::abdomen()).unwrap_err().to_string().contains("nodes"));
+        assert!(NeedleTool::new(c, abdomen().0).unwrap_err().to_string().contains("nodes"));
     }
 }
 
@@ -289,15 +289,17 @@ fn wander(seed: u64, ticks: usize) -> u64 {
     let mut hash = 0u64;
     let mut random = Random(seed);
     let rod = config().rod;
-    let mut tool = NeedleTool::new(NeedleConfig { max_force_n: 3.3, rod, ..config() }, MaterialTable::abdomen()).unwrap();
+    let (table, row) = abdomen();
+    let mut tool = NeedleTool::new(NeedleConfig { max_force_n: 3.3, rod, ..config() }, table).unwrap();
+    let [skin, muscle, vessel, bone, liver, lung] = ["skin", "muscle", "vessel", "bone", "liver", "lung"].map(row);
     let layered = |x: [f64; 3]| match x[2] {
         z if z < 0.0 => 0u8,
-        z if z < 12.0 => 1,
-        z if z < 30.0 => 2,
-        z if (x[0] - 10.0).hypot(z - 60.0) < 4.0 => 4,
-        z if (x[0] + 40.0).hypot(z - 40.0) < 8.0 => 7,
-        z if z < 120.0 => 3,
-        _ => 6,
+        z if z < 12.0 => skin,
+        z if z < 30.0 => muscle,
+        z if (x[0] - 10.0).hypot(z - 60.0) < 4.0 => vessel,
+        z if (x[0] + 40.0).hypot(z - 40.0) < 8.0 => bone,
+        z if z < 120.0 => liver,
+        _ => lung,
     };
     let (mut aim, mut at) = ([0.0f64; 6], [0.0f64; 6]);
     let (mut worst, mut inside, mut unconverged) = (0.0f64, 0usize, 0u64);

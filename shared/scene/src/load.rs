@@ -41,6 +41,14 @@ impl Scene {
     /// A scene file, or the built-in scene, with the volume it is to be run on (`--volume`), ready to use: files found,
     /// way points of `path:FILE` read.
     pub fn open(path: Option<&Path>, volume: Option<&Path>) -> Result<Self, SceneError> {
+        Self::open_with(path, volume, None)
+    }
+
+    /// The same with a motion model in place of the scene's own (`--motion`), which then need not be there.
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open), and when there is no such model, or the scene does not breathe.
+    pub fn open_with(path: Option<&Path>, volume: Option<&Path>, motion: Option<&Path>) -> Result<Self, SceneError> {
         let (name, text, folder) = match path {
             None => ("the built-in scene".to_string(), BUILTIN.to_string(), PathBuf::new()),
             Some(path) => {
@@ -74,7 +82,9 @@ impl Scene {
             let found = document.find_file("rendering.transfer", &transfer, &folder, "transfer function")?;
             scene.rendering.transfer = found.display().to_string();
         }
-        if let Some(model) = &scene.breathing.model {
+        if let Some(model) = motion {
+            scene.use_motion(model.to_path_buf())?;
+        } else if let Some(model) = &scene.breathing.model {
             scene.breathing.model = Some(document.find_file("breathing.model", model, &folder, "motion model")?);
         }
         if let Signal::Recorded(file) = &scene.breathing.signal {
@@ -534,6 +544,15 @@ fn check_needle(document: &Document, scene: &Scene, faults: &mut Vec<Fault>) {
         let at = |field: &str| format!("needle.tissue.{n}.{field}");
         if row.hu.is_some_and(|[low, high]| !(low.is_finite() && high.is_finite() && low < high)) {
             faults.push(document.fault(&at("hu"), format!("tissue `{}` has no range", row.name), "low must be below high", None));
+        }
+        if row.labels.is_empty() && row.hu.is_none() {
+            let help = Some("add `labels = [...]`, `hu = [low, high]`, or take the row out".into());
+            faults.push(document.fault(
+                &format!("needle.tissue.{n}"),
+                format!("tissue `{}` is nowhere", row.name),
+                "neither labels nor hu",
+                help,
+            ));
         }
         if row.labels.contains(&0) {
             let help = Some("0 is no tissue: what no row fits is as nothing".into());

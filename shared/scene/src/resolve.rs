@@ -47,6 +47,14 @@ impl Scene {
     /// position at rest, none outside the volume.
     pub fn resolve_path(&self, box_mm: &BoxMm, sample: impl Fn([f64; 3]) -> Option<f64>) -> Result<Option<Waypoints>, SceneError> {
         let Some(tool) = &self.tool else { return Ok(None) };
+        if let Some(at) = self
+            .needle
+            .target_mm
+            .filter(|at| self.has_effect("needle") && (0..3).any(|c| !(box_mm.low[c]..=box_mm.high[c]).contains(&at[c])))
+        {
+            let help = Some("give a point of the patient at rest, LPS mm; `maille info` tells where the volume lies".into());
+            return Err(SceneError::sentence(format!("needle.target_mm {at:?} lies outside the volume"), help));
+        }
         let (points, looped) = match &tool.approach {
             Some(approach) if tool.path.is_empty() => (self.approach_points(approach, tool.radius_mm, box_mm, &sample)?, tool.looped),
             _ => (given_points(&tool.path, box_mm), tool.looped),

@@ -200,6 +200,13 @@ fn files_are_looked_up_beside_the_scene_and_a_missing_one_points_at_its_line() {
     // with another volume put in, the scene's own is not looked for
     let patient = folder.join("patient.nrrd");
     assert_eq!(Scene::open(Some(&scene), Some(&patient)).unwrap().volume.file, Some(patient));
+    // nor its motion model, with another one put in
+    fs::write(&scene, "[volume]\nphantom = \"torso\"\n[breathing]\nmodel = \"none.motion\"\n[effects]\nbreathing = true\n").unwrap();
+    let model = folder.join("other.motion");
+    assert!(Scene::open(Some(&scene), None).unwrap_err().to_string().contains("none.motion"));
+    assert!(Scene::open_with(Some(&scene), None, Some(&model)).unwrap_err().to_string().contains("other.motion"));
+    fs::write(&model, "").unwrap();
+    assert_eq!(Scene::open_with(Some(&scene), None, Some(&model)).unwrap().breathing.model, Some(model));
 
     fs::write(&scene, "[rendering]\ntransfer = \"bnoe\"\n").unwrap();
     let error = Scene::load(&scene).unwrap_err();
@@ -232,4 +239,30 @@ fn a_patient_whom_nothing_tells_how_to_breathe_is_refused() {
         "{error}"
     );
     fs::remove_dir_all(&folder).unwrap();
+}
+
+const NEEDLE: &str = "[tool]\nkind = \"needle\"\n[[tool.path]]\ntime_s = 0\nmm = [0, 0, 0]\n[effects]\nneedle = true\n[needle]\n";
+
+#[test]
+fn a_needle_that_cannot_be_is_refused() {
+    for (line, says) in [
+        ("nodes = 65", "nodes = 65 is out of range"),
+        ("bent_radius_mm = 5", "bent_radius_mm = 5 is out of range"),
+        ("bent_from_mm = -1", "bent_from_mm = -1 is out of range"),
+        ("[[needle.tissue]]\nname = \"gristle\"", "tissue `gristle` is nowhere"),
+    ] {
+        let error = fault(&format!("{NEEDLE}{line}"));
+        assert!(error.to_string().contains(says), "{error}");
+    }
+    let bent = Scene::parse("bent", &format!("{NEEDLE}bent_radius_mm = 150\nbent_from_mm = 80")).unwrap();
+    assert_eq!((bent.needle.bent_radius_mm, bent.needle.bent_from_mm), (Some(150.0), 80.0));
+}
+
+#[test]
+fn a_target_outside_the_volume_is_refused() {
+    let volume = maille_scene::BoxMm { low: [-100.0; 3], high: [100.0; 3] };
+    let scene = |at: &str| Scene::parse("target", &format!("{NEEDLE}target_mm = {at}")).unwrap();
+    assert!(scene("[0, 0, 99]").resolve_path(&volume, |_| None).is_ok());
+    let error = scene("[0, 9000, 0]").resolve_path(&volume, |_| None).unwrap_err();
+    assert!(error.to_string().contains("target_mm") && error.to_string().contains("outside the volume"), "{error}");
 }

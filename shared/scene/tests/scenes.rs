@@ -67,3 +67,21 @@ fn another_volume_takes_the_approach_made_for_it_and_no_millimetres_of_the_old_o
     assert_eq!(tool.approach.unwrap().press_mm, 4.0);
     assert_eq!(scene.volume.source(), VolumeSource::File("other.nrrd".into()));
 }
+
+#[test]
+fn there_is_one_table_of_tissues_and_the_shipped_scene_has_it_written_out_with_its_sources() {
+    let path = scenes().into_iter().find(|path| path.ends_with("liver-puncture.toml")).expect("the scene of the liver");
+    let scene = Scene::load(&path).unwrap();
+    assert_eq!(scene.needle.tissue, maille_scene::needle::defaults());
+    // each row of both scenes says where its numbers come from
+    let patient = scenes_of("config/patients").into_iter().find(|path| path.ends_with("liver-puncture-4dct.toml")).unwrap();
+    for path in [path, patient] {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        let rows = lines.iter().enumerate().filter(|(_, line)| **line == "[[needle.tissue]]");
+        for (n, _) in rows {
+            assert!(["# made up: ", "# published"].iter().any(|start| lines[n - 1].starts_with(start)), "{}:{n}", path.display());
+        }
+        assert!(text.contains("Fortmeier et al. 2015"), "{}", path.display());
+    }
+}

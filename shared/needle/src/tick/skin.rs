@@ -39,6 +39,8 @@ impl NeedleTool {
         // back along the needle to where it is outside
         let at_rest = |back: f64, guess: V3| V3::from(inputs.breathing.to_reference(self.rod.point(length - back).into(), guess.into()));
         let (mut deep, mut found, mut back, mut at) = (0.0, None, 0.0, self.reference);
+        // what was found in tissue last: an inverse from another guess may lie on the other side of the border
+        let mut surface = (self.reference, inside);
         let mut step: f64 = 0.25;
         for _ in 0..MAX_SKIN_STEPS {
             back += step;
@@ -46,11 +48,12 @@ impl NeedleTool {
                 break;
             }
             at = at_rest(back, at);
-            if inputs.tissue.material_at(at.into()) == AIR {
+            let here = inputs.tissue.material_at(at.into());
+            if here == AIR {
                 found = Some(back);
                 break;
             }
-            deep = back;
+            (deep, surface) = (back, (at, here));
             step = (step * 1.1).min(0.05 * length);
         }
         let Some(mut air) = found else {
@@ -61,10 +64,12 @@ impl NeedleTool {
         for _ in 0..MAX_SKIN_HALVINGS {
             let middle = 0.5 * (skin + air);
             at = at_rest(middle, at);
-            if inputs.tissue.material_at(at.into()) == AIR { air = middle } else { skin = middle }
+            match inputs.tissue.material_at(at.into()) {
+                AIR => air = middle,
+                here => (skin, surface) = (middle, (at, here)),
+            }
         }
-        let at = at_rest(skin, at);
-        let material = inputs.tissue.material_at(at.into());
+        let (at, material) = surface;
         if skin <= TOUCH_MM || (!anew && skin <= MAX_JUMP_MM) {
             self.path.touch(at, material, &self.table);
             tell(told, Event { kind: EventKind::Contact, material, reference_mm: at.into(), depth_mm: 0.0, force_n: 0.0 });
@@ -73,6 +78,9 @@ impl NeedleTool {
         let pieces = ((skin / self.path.spacing_mm()).ceil() as usize).clamp(1, self.path.capacity().min(MAX_PATH_NODES) - 1);
         let mut last = at;
         self.path.lay((0..=pieces).map(|n| {
+            if n == 0 {
+                return surface;
+            }
             last = at_rest(skin * (1.0 - n as f64 / pieces as f64), last);
             (last, inputs.tissue.material_at(last.into()))
         }));

@@ -3,7 +3,8 @@
 #![allow(dead_code)]
 
 use maille_needle::{
-    Breathing, DeviceTip, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, RodParameters, Tissue,
+    Breathing, Capsule, DeviceTip, Gauge, HandlePose, Inputs, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, RodParameters,
+    Tissue,
 };
 
 /// Length of the needles here [mm].
@@ -114,4 +115,23 @@ impl Random {
     pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit()
     }
+}
+
+/// The table that scenes have, and where a tissue is in it.
+pub fn abdomen() -> (MaterialTable, impl Fn(&str) -> u8) {
+    let rows = maille_scene::needle::defaults();
+    let of: Vec<Material> = rows
+        .iter()
+        .map(|t| Material {
+            stiffness_n_per_mm: t.stiffness_n_per_mm,
+            a1_n_per_mm: t.a1_n_per_mm,
+            a2_n_per_mm2: t.a2_n_per_mm2,
+            cutting_force_n: t.cutting_force_n,
+            friction_n: t.friction_n,
+            capsule: t.capsule_n.map(|force| Capsule { cutting_force_n: force, thickness_mm: t.capsule_mm }),
+            relaxing: t.relaxing,
+            relaxation_s: t.relaxation_s,
+        })
+        .collect();
+    (MaterialTable::new(&of).unwrap(), move |name: &str| rows.iter().position(|t| t.name == name).unwrap() as u8 + 1)
 }
