@@ -19,7 +19,7 @@ use core::sync::atomic::{
 };
 
 /// "maille" and the version of this layout.
-pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille06");
+pub const CONTROL_MAGIC: u64 = u64::from_le_bytes(*b"maille07");
 /// Pins in the block.
 pub const PINS: usize = 32;
 /// A pin that pins nothing.
