@@ -104,6 +104,8 @@ pub(crate) struct NeedleStage {
     path_reference: Vec<V3>,
     /// what goes through the handle: energy of force and torque
     port: NeedlePort,
+    /// nobody breathes: the hand gets no energy that it did not put in
+    still: bool,
     /// in a scene in which tissue is dragged along
     drag: Option<Box<Dragged>>,
     /// what the tick's rod left [1e-12 mm]
@@ -197,6 +199,7 @@ impl NeedleStage {
             ticks: 0,
             path_reference: Vec::with_capacity(room),
             port: NeedlePort::default(),
+            still: !scene.has_effect("breathing"),
             drag: scene.has_effect("needle-drag").then(|| Box::new(dragged())),
             residual: None,
             faults: [0; 5],
@@ -230,6 +233,7 @@ impl NeedleStage {
         }
         let force_n = self.force.shape(out.force_n, step, fading);
         let torque_n_mm = self.torque.shape(out.torque_n_mm, step, fading);
+        let [force_n, torque_n_mm] = if self.still { self.port.lower(force_n, torque_n_mm) } else { [force_n, torque_n_mm] };
         self.ticks += 1;
         self.drag(moment.now_ns, breathing);
         // where tissue gives way the needle is seen where the hand has it
