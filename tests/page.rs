@@ -8,6 +8,7 @@ use browser::{Browser, chromium};
 use serde_json::Value;
 use std::{
     io::{BufRead, BufReader},
+    path::PathBuf,
     process::{Child, Command, Stdio},
     sync::mpsc,
     time::{Duration, Instant},
@@ -75,6 +76,16 @@ fn signal(name: &str, pid: u32) {
     assert!(sent.is_ok(), "no `kill` command");
 }
 
+/// The browser to test in; without one a test is skipped and says so, in CI it fails.
+fn required_chromium() -> Option<PathBuf> {
+    let found = chromium();
+    assert!(found.is_some() || std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
+    if found.is_none() {
+        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
+    }
+    found
+}
+
 /// Helpers in the page: pixels of a view as grey values, and how much two pictures differ.
 const HELPERS: &str = "
     window.grey = (view) => {
@@ -110,11 +121,7 @@ fn click(browser: &mut Browser, id: &str) {
 
 #[test]
 fn the_page_lives_obeys_and_survives_a_killed_rendering() {
-    let Some(chromium) = chromium() else {
-        assert!(std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
-        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
-        return;
-    };
+    let Some(chromium) = required_chromium() else { return };
     let run = Run::start(&[]);
     let mut browser = Browser::open(&chromium, &run.address, 1600, 900);
     browser.until("the first frame", "Number(document.body?.dataset.frames ?? 0) >= 2");
@@ -200,11 +207,7 @@ const BREATHING: &str = "name = \"breath\"\n[volume]\nphantom = \"torso\"\nsize 
 
 #[test]
 fn the_page_holds_the_breath_leads_it_and_lets_it_go_on() {
-    let Some(chromium) = chromium() else {
-        assert!(std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
-        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
-        return;
-    };
+    let Some(chromium) = required_chromium() else { return };
     let scene = std::env::temp_dir().join(format!("maille-page-breath-{}.toml", std::process::id()));
     std::fs::write(&scene, BREATHING).expect("a scene");
     let run = Run::start(&[scene.to_str().expect("a path in UTF-8")]);
@@ -259,11 +262,7 @@ const ORGANS: &str = "name = \"organs\"\n[volume]\nphantom = \"torso\"\nsize = [
 
 #[test]
 fn the_page_shows_an_organ_alone_and_the_patient_again() {
-    let Some(chromium) = chromium() else {
-        assert!(std::env::var_os("CI").is_none(), "CI must have Chromium: the page is tested in it");
-        eprintln!("SKIPPED: no Chromium on the PATH, so the page was not tested");
-        return;
-    };
+    let Some(chromium) = required_chromium() else { return };
     let scene = std::env::temp_dir().join(format!("maille-page-organs-{}.toml", std::process::id()));
     std::fs::write(&scene, ORGANS).expect("a scene");
     let run = Run::start(&[scene.to_str().expect("a path in UTF-8")]);

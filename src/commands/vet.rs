@@ -51,9 +51,7 @@ pub fn run(args: &Args) -> Outcome {
 /// What this machine has of a kind of device, in one sentence.
 pub fn probe(kind: Kind) -> String {
     let device = kind.name();
-    let mut command = Command::new("/proc/self/exe");
-    command.arg0("maille").args(["vet-device", device, "--probe"]);
-    let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
+    let child = asks(device).arg("--probe").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
     match child.and_then(|child| output_within(child, PATIENCE)) {
         Err(error) => format!("cannot be looked at: {error}"),
         Ok(None) => format!("its library was still busy after {} s; is a driver of it hanging?", PATIENCE.as_secs()),
@@ -88,11 +86,17 @@ pub fn scene(scene: &Scene) -> Result<(), String> {
     }
 }
 
+/// Another process that opens the library of a device.
+fn asks(device: &str) -> Command {
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("maille").args(["vet-device", device]);
+    command
+}
+
 /// Has another process open the library of a device.
 fn library_of(device: &str, scene: &Scene) -> Result<(), String> {
     let cannot = |reason: &dyn std::fmt::Display| format!("the library of the device `{device}` cannot be looked at: {reason}");
-    let mut command = Command::new("/proc/self/exe");
-    command.arg0("maille").args(["vet-device", device]);
+    let mut command = asks(device);
     if let Some(library) = &scene.device.library {
         command.arg("--library").arg(library);
     }

@@ -26,13 +26,14 @@ pub(crate) fn options(scene: &Scene, kind: Option<Kind>) -> Result<Options, Hapt
     let usual = Options::default();
     let origin_mm = d.origin_mm.unwrap_or_default();
     let front = kind.map_or(Mounting { origin_mm, ..Mounting::default() }, |kind| Mounting::in_front_of_patient(kind, origin_mm));
+    let priority = scene.haptic.priority.min(99) as i32;
     Ok(Options {
         address: d.address.clone().unwrap_or(usual.address),
         library: d.library.clone(),
         device: d.id.clone(),
         mounting: Mounting { rotation: d.rotation.unwrap_or(front.rotation), scale: d.scale.unwrap_or(1.0), ..front },
         // below the tick, above all else; of the lowest there is none below
-        priority: i32::try_from(scene.haptic.priority.min(99)).map_or(98, |priority| if priority > 1 { priority - 1 } else { priority }),
+        priority: if priority > 1 { priority - 1 } else { priority },
         profile: d.profile.as_ref().map(named).transpose()?,
         ..usual
     })

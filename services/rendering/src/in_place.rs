@@ -95,13 +95,18 @@ pub(crate) struct World {
     pub scene: Scene,
 }
 
+/// A ball of tissue in air.
+pub fn ball() -> Volume {
+    let grid = Grid::axis_aligned([64; 3], [1.0; 3]);
+    let inside = |n: usize| [n % 64, n / 64 % 64, n / 4096].iter().map(|&c| (c as f64 - 31.5).powi(2)).sum::<f64>() < 28.0 * 28.0;
+    let voxels = (0..grid.voxel_count()).map(|n| if inside(n) { 60 } else { -1000 }).collect();
+    Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels)
+}
+
 impl World {
     /// A ball of tissue in air, of which one octant has been rewritten.
     pub fn new() -> Self {
-        let grid = Grid::axis_aligned([64; 3], [1.0; 3]);
-        let ball = |n: usize| [n % 64, n / 64 % 64, n / 4096].iter().map(|&c| (c as f64 - 31.5).powi(2)).sum::<f64>() < 28.0 * 28.0;
-        let voxels = (0..grid.voxel_count()).map(|n| if ball(n) { 60 } else { -1000 }).collect();
-        let volume = Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels);
+        let volume = ball();
         let domain = Domain::fresh().unwrap();
         let control = ControlMap::create(&domain).unwrap();
         let keeper = StoreKeeper::create(&domain, &volume, StoreSizes::for_volume(64, 16, 3, false), |_| {}).unwrap();

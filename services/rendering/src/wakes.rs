@@ -1,10 +1,11 @@
 //! The loop itself, in a domain of its own: a commit into a picture that stands is drawn at once, and no storm of them draws more frames than the rate says.
 
+use crate::in_place::ball;
 use maille_contract::{ControlBlock, FrameHeader, Role, RunState, ServiceState, clock::REAL_TIME_PPM, clock::SimulationClock};
 use maille_scene::Scene;
 use maille_store::{StoreKeeper, StoreSizes, Writer};
 use maille_transport::{ControlMap, Domain, FrameSubscriber, Node, monotonic_ns};
-use maille_volume::{Grid, Rescale, Volume};
+
 use std::{sync::atomic::Ordering::Relaxed, time::Duration};
 
 /// Slow, so that waiting for a beat is far longer than a frame and than what a busy machine adds.
@@ -38,10 +39,7 @@ fn commit(writer: &mut Writer, n: u64) -> u64 {
 
 #[test]
 fn a_commit_into_a_picture_that_stands_is_drawn_at_once_and_a_storm_of_them_at_the_rate() {
-    let grid = Grid::axis_aligned([64; 3], [1.0; 3]);
-    let ball = |n: usize| [n % 64, n / 64 % 64, n / 4096].iter().map(|&c| (c as f64 - 31.5).powi(2)).sum::<f64>() < 28.0 * 28.0;
-    let voxels = (0..grid.voxel_count()).map(|n| if ball(n) { 60 } else { -1000 }).collect();
-    let volume = Volume::new(grid, Rescale { slope: 1.0, intercept: 0.0 }, voxels);
+    let volume = ball();
     let domain = Domain::fresh().unwrap();
     let control = ControlMap::create(&domain).unwrap();
     let _keeper = StoreKeeper::create(&domain, &volume, StoreSizes::for_volume(64, 64, 3, false), |_| {}).unwrap();

@@ -27,6 +27,15 @@ fn head() -> Option<BrickedVolume> {
     Some(BrickedVolume::from_volume(&read_volume(&path).expect("the head can be read").0))
 }
 
+/// How far from a point the surface is, seen from outside along a ray [mm].
+fn surface_mm(tissue: &impl Surface, center: V3, outward: V3, threshold: f64) -> f64 {
+    let mut r = 140.0;
+    while r > 20.0 && !tissue.value((center + outward * r).into()).is_some_and(|v| v >= threshold) {
+        r -= 0.5;
+    }
+    r
+}
+
 /// Slides along an arc around the head's middle at 50 mm/s, the hand wanting 12 mm below the surface. Gives the largest step in parts of
 /// max(force, 0.5 N), the part of ticks in contact, and prints the time of a tick.
 fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, shape: ToolShape, grip: Grip) -> (f64, f64) {
@@ -34,14 +43,7 @@ fn slide(volume: &BrickedVolume, threshold: f64, elevation: f64, shape: ToolShap
     let tissue = Isosurface::new(volume, threshold);
     let center = V3::from(volume.info().grid.center());
     let direction = |angle: f64| V3::new(angle.sin(), -angle.cos(), elevation).normalize();
-    // the surface from outside along a ray
-    let surface = |u: V3| {
-        let mut r = 140.0;
-        while r > 20.0 && !tissue.value((center + u * r).into()).is_some_and(|v| v >= threshold) {
-            r -= 0.5;
-        }
-        r
-    };
+    let surface = |u: V3| surface_mm(&tissue, center, u, threshold);
     let mut core = HapticCore::new(HapticConfig {
         shape,
         passivity: true,
@@ -125,12 +127,9 @@ fn led(volume: &BrickedVolume, threshold: f64, elevation: f64, along: V3, speed_
     let center = V3::from(volume.info().grid.center());
     let inward = -V3::new(-0.2, -1.0, elevation).normalize();
     let along = (along - inward * along.dot(&inward)).normalize();
-    let mut r = 140.0;
-    while r > 20.0 && !tissue.value((center - inward * r).into()).is_some_and(|v| v >= threshold) {
-        r -= 0.5;
-    }
+    let r = surface_mm(&tissue, center, -inward, threshold);
     let (config, _) = HapticConfig::on_device(3.0, 2.0, 5e-4, 1e-3, &DEVICE).unwrap();
-    let mut core = HapticCore::new(config);
+    let mut driver = Driver::new(config);
     let (mut worst, mut touched, mut last) = (0.0f64, 0, None::<V3>);
     for n in 0..6_000u64 {
         let t = n as f64 * 1e-3;
@@ -139,16 +138,7 @@ fn led(volume: &BrickedVolume, threshold: f64, elevation: f64, along: V3, speed_
         let phase = ((t - 1.5).max(0.0) % round) / round;
         let way = 12.0 * (1.0 - (2.0 * phase - 1.0).abs()) - 6.0;
         let at = center - inward * (r + lift) + along * (way + 6.0);
-        let pose = DevicePose { direction: inward.into(), ..pose(at) };
-        let out = core.tick(&TickInputs {
-            now_ns: n * 1_000_000,
-            pose,
-            pose_age_s: 0.0,
-            tissue: Some(&tissue),
-            epoch: 0,
-            tissue_age_s: 0.0,
-            release: false,
-        });
+        let out = driver.tick_pose(&tissue, 0, DevicePose { direction: inward.into(), ..pose(at) });
         let f = V3::from(out.force_n);
         if n >= 1_500 {
             if let Some(last) = last {
