@@ -131,8 +131,10 @@ impl Operator {
         };
         self.backwards += u64::from(said.measured_ns < std::mem::replace(&mut self.measured_ns, said.measured_ns));
         // what was measured later than now has no age: it would never grow stale
-        self.turned = (said.flags & DEVICE_KNOWS_ORIENTATION != 0).then_some(said.orientation);
         let from_the_future = said.measured_ns > monotonic_ns.saturating_add(AHEAD_NS);
+        if said.flags & DEVICE_VALID != 0 && !from_the_future {
+            self.turned = (said.flags & DEVICE_KNOWS_ORIENTATION != 0).then_some(said.orientation);
+        }
         self.pose = DevicePose {
             position_mm: said.position_mm,
             direction: said.direction,

@@ -138,7 +138,7 @@ impl<'a, W: Stopwatch> Loop<'a, W> {
         }
         if let Some((last, _)) = control.tool.load::<ToolState>().filter(|(last, _)| last.flags & TOOL_IN_CONTACT != 0) {
             let (tip_mm, proxy_mm) = self.breather.as_ref().map_or((last.tip_mm, last.proxy_mm), |breather| breather.resume(&last));
-            self.core.resume(tip_mm, proxy_mm);
+            self.core.resume(tip_mm, proxy_mm, last.force_n);
         }
     }
 

@@ -10,14 +10,15 @@
 //! that went away (exhaling) is let go within some 0.1 s. At δ = 0 the contact ends and m is forgotten. What is no
 //! pushing is carried in a second term β that goes to 0 within 0.1 s, δ = max(0, d + m + β): a
 //! surface that comes towards the ball (relaxing or breathing tissue) beyond where it was met, a new threshold, a foot that
-//! jumps to a nearer wall. So all of these are felt, and none as a step.
+//! jumps to a nearer wall. So all of these are felt, and none as a step. Of β the part that leaps of the foot made is kept apart, λ: no tissue moved there.
 //!
 //! Energy: along the normal the tissue is a spring in δ; a commit leaves δ unchanged; fading m > 0 only lowers the stored
 //! energy. So neither commits nor sliding can feed the hand; β can, as tissue that moves by itself does, by a bounded amount, which is told
-//! ([`Felt::granted_mj`]).
+//! ([`Felt::granted_mj`]). What λ gives is nobody's work: it is not told, and the passivity controller takes it.
 //!
 //! **Blend.** What remains of a discontinuity (normal and tangential direction at a commit, a foot that jumps to another wall, a new
-//! threshold) is bridged: the difference to the last force is added and taken away linearly within `blend_s`.
+//! threshold) is bridged: the difference to the last force is added and taken away linearly within `blend_s`. Where the normal turns by more than
+//! [`MAX_TURN`] in a tick (the foot leaps from side to side of a dent as narrow as the ball), what that alone changes is bridged likewise.
 //! Units: mm, N, s. Cost: `proxy`'s. Allocation: none.
 
 use crate::{
@@ -44,6 +45,8 @@ const DAMPING_DEPTH_MM: f64 = 0.5;
 const MATERIAL_DEPTH_MM: f64 = 1.5;
 /// Largest component of a force that is believed [N]: a hundred times what devices give.
 const MAX_NODE_N: f64 = 1e3;
+/// Turn of the normal in a tick that is felt as it is [rad].
+const MAX_TURN: f64 = 0.03;
 /// Largest give-way that is believed [mm].
 const MAX_GIVE_WAY_MM: f64 = 60.0;
 
@@ -102,11 +105,16 @@ pub(crate) struct Node {
     friction: Friction,
     /// m [mm]
     give_way: f64,
-    /// β [mm]
+    /// β without λ [mm]
     bias: f64,
+    /// λ [mm]
+    leapt: f64,
+    /// largest δ of this contact [mm]
+    deepest: f64,
     /// largest gap between ball and tissue since they last touched [mm]
     gap: f64,
     last_point: Option<V3>,
+    last_normal: V3,
     material: Option<Material>,
     /// at the last tick [N]
     last_force: V3,
@@ -136,8 +144,11 @@ impl Node {
             friction: Friction::default(),
             give_way: 0.0,
             bias: 0.0,
+            leapt: 0.0,
+            deepest: 0.0,
             gap: 0.0,
             last_point: None,
+            last_normal: V3::zeros(),
             material: None,
             last_force: V3::zeros(),
             bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
@@ -201,13 +212,13 @@ impl Node {
         let bias = self.bias;
         if self.last_point.is_some() {
             let change = before.filter(|_| blend.is_some()).map(|before| before - d);
-            self.carry(change, now.committed && !now.other_surface, d, point, now.dt);
+            self.carry(change, now, d, point);
         } else if moved || now.committed || now.other_surface {
             // already pressed where it is found first, or met by tissue that came: felt gradually, but for what the hand's own motion did
             let own = before.filter(|_| !moved).unwrap_or(0.0).max(0.0);
-            self.bias = -(d - own).max(0.0);
+            *(if now.committed || now.other_surface { &mut self.bias } else { &mut self.leapt }) = -(d - own).max(0.0);
         }
-        let delta = (d + self.give_way + self.bias).max(0.0);
+        let delta = (d + self.give_way + self.bias + self.leapt).max(0.0);
         if delta <= 0.0 && d <= 0.0 {
             self.end_contact();
             felt.force = self.bridged(V3::zeros(), now.dt, if now.jumped { lost } else { blend });
@@ -217,9 +228,14 @@ impl Node {
         felt.at = point;
         felt.contact = Some((contact, delta));
         self.indentation_mm = delta;
-        let force = self.law(tissue, (point, normal, delta), velocity, slope, now, &mut felt);
+        let force = self.law(tissue, (point, normal, delta), (x, velocity), slope, now, &mut felt);
         if blend.is_none() {
             felt.granted_mj = (self.bias - bias).max(0.0) * force.dot(&normal).max(0.0);
+        }
+        let turned = normal - std::mem::replace(&mut self.last_normal, normal);
+        if was_felt && blend.is_none() && turned.norm() > MAX_TURN {
+            let left = self.bridge.difference * self.bridge.left - turned * force.dot(&normal).max(0.0);
+            self.bridge = Bridge { difference: left, left: 1.0, duration_s: now.config.blend_s };
         }
         felt.force = self.bridged(force, now.dt, blend);
         felt
@@ -227,19 +243,17 @@ impl Node {
 
     /// Carries m and β over a tick. A surface that moved changed d by −`change`: that goes to m when a commit did it (β takes what
     /// would make m negative) and to β when not. Sliding, a growing gap and time let them fade.
-    fn carry(&mut self, change: Option<f64>, committed: bool, d: f64, point: V3, dt: f64) {
+    fn carry(&mut self, change: Option<f64>, now: &Circumstances<'_>, d: f64, point: V3) {
+        let dt = now.dt;
         let travelled = self.last_point.map_or(V3::zeros(), |last| point - last);
         match change {
-            Some(change) if committed => {
+            Some(change) if now.committed && !now.other_surface => {
                 self.give_way += change;
                 self.bias += self.give_way.min(0.0);
                 self.give_way = self.give_way.max(0.0);
-                self.friction.carry(travelled);
             }
-            Some(change) => {
-                self.bias += change;
-                self.friction.carry(travelled);
-            }
+            Some(change) if now.other_surface => self.bias += change,
+            Some(change) => self.leapt += change,
             None => self.give_way *= (-travelled.norm() / (2.0 * self.proxy.radius_mm())).exp(),
         }
         let gap = (-d).max(0.0);
@@ -251,7 +265,9 @@ impl Node {
         }
         // tissue that has gone away from the tip was not pushed there: let go within the same time as what comes
         self.give_way = (self.give_way - (gap - OWN_GAP_MM).max(0.0) * dt / BIAS_S).max(0.0);
-        self.bias = (self.bias * (-dt / BIAS_S).exp()).clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
+        for bias in [&mut self.bias, &mut self.leapt] {
+            *bias = (*bias * (-dt / BIAS_S).exp()).clamp(-MAX_GIVE_WAY_MM, MAX_GIVE_WAY_MM);
+        }
         self.give_way = self.give_way.min(MAX_GIVE_WAY_MM);
     }
 
@@ -260,7 +276,7 @@ impl Node {
         &mut self,
         tissue: &S,
         (point, normal, delta): (V3, V3, f64),
-        velocity: V3,
+        (x, velocity): (V3, V3),
         slope: f64,
         now: &Circumstances<'_>,
         felt: &mut Felt,
@@ -277,9 +293,11 @@ impl Node {
         let normal_n = (elastic - damping * velocity.dot(&normal)).max(0.0);
         let mut force = normal * normal_n;
         if now.config.friction {
-            // tangentially as stiff as the tissue's first contact, within the coupling
-            let k = material.stiffness_n_per_mm.min(slope);
-            let rubbing = self.friction.force(point, normal, normal_n, k, material.friction_static, material.friction_kinetic);
+            // tangentially as stiff as along the normal from first touch to where it was pressed deepest, within the coupling: a hand that trembles
+            // changes nothing
+            self.deepest = self.deepest.max(delta);
+            let k = (material.stiffness_n_per_mm + material.stiffening_n_per_mm2 * self.deepest).min(slope);
+            let rubbing = self.friction.force(x, normal, normal_n, k, material.friction_static, material.friction_kinetic);
             if k > 0.0 {
                 felt.elastic_mj += self.share * 0.5 * rubbing.norm_squared() / k;
             }
@@ -309,7 +327,7 @@ impl Node {
 
     fn end_contact(&mut self) {
         self.give_way = 0.0;
-        self.bias = 0.0;
+        (self.bias, self.leapt, self.deepest) = (0.0, 0.0, 0.0);
         self.gap = 0.0;
         self.last_point = None;
         self.material = None;

@@ -113,6 +113,17 @@ impl Proxy {
         }
     }
 
+    /// As if the tip had come straight to `at`, against `outward`, from where tissue ends there [mm]. Where it does not end within
+    /// [`MAX_BACK_STEPS`] half voxels, nothing changes.
+    pub fn resume_along<S: Surface + ?Sized>(&mut self, tissue: &S, at: [f64; 3], outward: [f64; 3]) {
+        let (Some(at), Some(outward)) = (finite(at), finite(outward).and_then(|out| out.try_normalize(1e-9))) else { return };
+        let step = outward * (0.5 * tissue.resolution_mm());
+        let out = (0..=MAX_BACK_STEPS).map(|n| at + step * n as f64).find(|&x| !is_inside(tissue, x));
+        if let Some(out) = out {
+            self.resume(out.into());
+        }
+    }
+
     /// Height of a position over the last foot's tangent plane [mm], if there is a foot.
     pub fn height_over_foot_mm(&self, at: [f64; 3]) -> Option<f64> {
         match self.state {

@@ -83,9 +83,15 @@ impl ForceShaper {
         self.last = clamp_norm(force, self.limits.max_force_n);
     }
 
-    /// A force held to the largest there may be [N].
-    pub(crate) fn held(&self, force: V3) -> [f64; 3] {
-        clamp_norm(force, self.limits.max_force_n).into()
+    /// A force held to the largest there may be [N], and where it is larger than the one given `dt_s` before, to the slew limit from that: what is cut for
+    /// passivity's sake may fall faster, nothing rises so.
+    pub(crate) fn risen(&self, given: V3, force: V3, dt_s: f64) -> [f64; 3] {
+        let force = clamp_norm(force, self.limits.max_force_n);
+        if force.norm() <= given.norm() {
+            return force.into();
+        }
+        let change = clamp_norm(force - given, self.limits.max_slew_n_per_s * dt_s.max(0.0));
+        clamp_norm(given + change, self.limits.max_force_n).into()
     }
 
     /// The force to give [N] when `wanted_n` is wanted, `dt_s` after the last call; `fading` while it shall go to zero.

@@ -263,6 +263,10 @@ pub struct HapticCore {
     /// energy in the contacts' springs [mJ]
     elastic_mj: f64,
     ticks: usize,
+    /// force at the last tick [N]
+    given: V3,
+    /// where tissue that another core felt pushed, for the first tick
+    resumed: Option<V3>,
 }
 
 impl HapticCore {
@@ -311,6 +315,8 @@ impl HapticCore {
             last_torque: V3::zeros(),
             elastic_mj: 0.0,
             ticks: 0,
+            given: V3::zeros(),
+            resumed: None,
             config,
         }
     }
@@ -340,13 +346,15 @@ impl HapticCore {
         self.passivity.energy_mj()
     }
 
-    /// Goes on with a contact that another core held: the tip's centre was last at `tip_mm`, held at `proxy_mm`, outside tissue. To be
-    /// called before the first tick; without it a tip that starts inside tissue is buried, and so it is when it starts more than a jump
-    /// away. The force rises from zero all the same.
-    pub fn resume(&mut self, tip_mm: [f64; 3], proxy_mm: [f64; 3]) {
+    /// Goes on with a contact that another core held: the tip's centre was last at `tip_mm`, the deepest node was held at `proxy_mm`, outside tissue, and
+    /// the force was `force_n` [N]. To be called before the first tick; without it a tip that starts inside tissue is buried, and so it is when it
+    /// starts more than a jump away. Several nodes look for the way out of tissue each for itself, where the force pushed. The force rises from zero all the
+    /// same.
+    pub fn resume(&mut self, tip_mm: [f64; 3], proxy_mm: [f64; 3], force_n: [f64; 3]) {
         self.position = finite(tip_mm);
-        // only the node at the tip was told of
         self.nodes[0].proxy.resume(proxy_mm);
+        let out = [finite(force_n), Some(V3::from(proxy_mm) - V3::from(tip_mm))];
+        self.resumed = out.into_iter().flatten().find_map(|out| out.try_normalize(1e-3));
     }
 
     /// One tick. Allocates nothing; bounded work.
@@ -415,8 +423,10 @@ impl HapticCore {
             let share = self.passivity.share();
             self.shaper.cut_to(V3::from(out.force_n) * share);
             self.torque_shaper.cut_to(V3::from(out.torque_n_mm) * share);
-            (out.force_n, out.torque_n_mm) = (self.shaper.held(force), self.torque_shaper.last_n());
+            // a damper that lets go adds to what the limits let rise
+            (out.force_n, out.torque_n_mm) = (self.shaper.risen(self.given, force, step), self.torque_shaper.last_n());
         }
+        self.given = out.force_n.into();
         let torque = V3::from(out.torque_n_mm) / self.config.patient_mm_per_hand_mm;
         self.passivity.given(V3::from(out.force_n) * self.gives, torque * self.gives);
         out.fading = fading;
@@ -490,7 +500,10 @@ impl HapticCore {
     /// Orientation of the tool in this tick; whether it, or the device before, jumped.
     fn turn(&mut self, pose: &DevicePose, dt: f64, jumped: bool) -> bool {
         let last = self.world_from_tool;
-        let next = match (self.orientation.take(), finite(pose.direction).and_then(|d| d.try_normalize(1e-9)), last) {
+        // a pose that is not vouched for turns nothing
+        let told = self.orientation.take().filter(|_| pose.valid);
+        let direction = finite(pose.direction).filter(|_| pose.valid || last.is_none()).and_then(|d| d.try_normalize(1e-9));
+        let next = match (told, direction, last) {
             (Some(told), _, _) => Some(told),
             (None, None, _) => last,
             (None, Some(direction), last) => {
@@ -562,6 +575,7 @@ impl HapticCore {
         self.elastic_mj = 0.0;
         let stiffness = self.rendered_stiffness();
         let called: f64 = self.nodes[..count].iter().map(|node| node.called_for(stiffness)).sum();
+        let resumed = self.resumed.take().filter(|_| count > 1 && !jumped);
         let weights: f64 = self.nodes.iter().zip(shape.nodes()).map(|(node, of)| of.share * node.weight()).sum();
         for (n, (node, of)) in self.nodes.iter_mut().zip(shape.nodes()).enumerate() {
             let mut arm = rotation * V3::from(of.offset_mm);
@@ -569,6 +583,9 @@ impl HapticCore {
                 arm = finite(moving.place(arm.into())).unwrap_or(arm);
             }
             let velocity = self.velocity + self.spin.cross(&arm);
+            if let Some(outward) = resumed {
+                node.proxy.resume_along(tissue, (x + arm).into(), outward.into());
+            }
             let search = (n + count - self.ticks * MAX_SEARCHES % count) % count < MAX_SEARCHES;
             let slope = node.slope(called, weights, stiffness);
             let felt = node.touch(tissue, (x + arm, velocity), search, slope, &now);

@@ -111,3 +111,29 @@ fn damping_resists_the_motion_by_its_coefficient() {
     assert_eq!(at_depth.len(), 2);
     assert!((at_depth[0] - at_depth[1] - 2.0 * 3e-4 * 40.0).abs() < 1e-3, "{at_depth:?}");
 }
+
+/// Tissue that is soft at first, or begins with nothing, rubs by its coefficients as any other: within the way in which it was pressed.
+#[test]
+fn tissue_that_stiffens_from_nothing_rubs_by_its_coefficients() {
+    for (a1, a2, mu) in [(0.5, 0.0, 0.5), (0.1, 0.05, 0.5), (0.005, 0.05, 0.5), (0.0, 0.05, 0.5), (0.0, 0.2, 0.3)] {
+        let law = Material {
+            stiffness_n_per_mm: a1,
+            stiffening_n_per_mm2: a2,
+            damping_n_s_per_mm: 0.0,
+            friction_static: mu,
+            friction_kinetic: 0.8 * mu,
+        };
+        let mut d = Driver::new(HapticConfig { friction: true, ..plain(2.0, law) });
+        let tissue = wall();
+        for n in 0..1000 {
+            d.tick(&tissue, 1, V3::new(0.0, 0.0, 3.0 - 0.005 * f64::from(n)));
+        }
+        let (mut peak, mut last) = (0.0f64, 0.0);
+        for n in 0..2000 {
+            let out = d.tick(&tissue, 1, V3::new(0.01 * f64::from(n), 0.0, -2.0));
+            last = -out.force_n[0] / out.force_n[2];
+            peak = peak.max(last);
+        }
+        assert!((peak - mu).abs() < 0.02 * mu && (last - 0.8 * mu).abs() < 0.01 * mu, "a₁ {a1}, a₂ {a2}: {peak}, {last} for {mu}");
+    }
+}

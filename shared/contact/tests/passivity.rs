@@ -286,3 +286,42 @@ fn friction_of_half_a_step_ends_the_limit_cycle_and_without_it_the_cycle_is_boun
         assert!((1e-4..2.0 * QUANTUM_MM).contains(&without), "K {stiffness}: {without} mm");
     }
 }
+
+/// A wall that stands still, rippled so that the foot leaps from crest to crest, stroked by a hand that presses with 1 N for 20 s: nothing in it moves by
+/// itself, and nothing comes out.
+#[test]
+fn strokes_over_ripples_bring_nothing_out() {
+    let field = |amplitude: f64| {
+        move |at: [f64; 3]| {
+            let k = std::f64::consts::TAU / 3.1;
+            let value = -100.0 * (at[2] - amplitude * (k * at[0]).sin());
+            VolumeSample { value, gradient: [100.0 * amplitude * k * (k * at[0]).cos(), 0.0, -100.0] }
+        }
+    };
+    for (amplitude, stiffness) in [(0.3, 0.5), (0.3, 2.0), (0.2, 2.0), (0.1, 2.0)] {
+        for grip in [Grip::FULL, Grip::LIGHT] {
+            let tissue = AnalyticSurface { field: field(amplitude), threshold: 0.0, resolution_mm: 1.0 };
+            let mut core = HapticCore::new(config(stiffness, true, 2));
+            let target = |t: f64| {
+                let deep = 20.0 * (1.0 - t).max(0.0) + 2.0 - 1.0 / grip.stiffness_n_per_mm;
+                V3::new(10.0 * (2.0 * t).sin(), 0.0, deep)
+            };
+            let mut hand = SimulatedHand::new(grip, target(0.0).into(), [0.0, 0.0, -1.0]).with_encoder(0.01, 2);
+            let (mut energy, mut most, mut force) = (0.0f64, 0.0f64, V3::zeros());
+            for n in 0..20_000u64 {
+                let now_ns = n * 1_000_000;
+                hand.set_target(target(n as f64 * T).into());
+                let before = V3::from(hand.true_position_mm());
+                let pose = hand.read(now_ns);
+                energy += force.dot(&(V3::from(hand.true_position_mm()) - before));
+                most = most.max(energy);
+                let tissue = Some(&tissue);
+                let out = core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue, epoch: 0, tissue_age_s: 0.0, release: false });
+                hand.write(out.force_n);
+                force = out.force_n.into();
+            }
+            println!("ripples of {amplitude} mm, {stiffness} N/mm: at most {most:.2} mJ out, {energy:.2} at the end");
+            assert!(most <= 1.0, "ripples of {amplitude} mm, {stiffness} N/mm: {most} mJ");
+        }
+    }
+}

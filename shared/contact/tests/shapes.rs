@@ -242,3 +242,46 @@ fn orientations_are_taken_and_bad_ones_ignored() {
     assert_eq!(felt.iter().map(|o| o.nodes.count_ones()).collect::<Vec<_>>(), [2, 1, 1, 1]);
     assert!((felt[0].force_n[2] - 0.5).abs() < 1e-6 && (felt[1].force_n[2] - 0.5).abs() < 1e-6, "{felt:?}");
 }
+
+/// A finger, a probe and a shaft that press, and whose process dies: the next core, told of tip, deepest proxy and force alone, gives the force again.
+#[test]
+fn tools_of_several_balls_go_on_where_another_core_left_them() {
+    let tissue = wall();
+    for shape in [ToolShape::finger(8.0), ToolShape::probe(40.0, 60.0, 8.0), ToolShape::capsule(3.0, 40.0)] {
+        let (at, direction) = (V3::new(0.3, -0.2, -2.0), V3::new(0.2, 0.1, -1.0).normalize());
+        let before = lowered(&mut HapticCore::new(config(shape)), &tissue, at, direction);
+        assert!(before.force_n[2] > 1.0 && before.nodes.count_ones() >= 1, "{before:?}");
+        let mut core = HapticCore::new(config(shape));
+        core.resume(before.tip_mm, before.proxy_mm, before.force_n);
+        let mut after = None;
+        for n in 0..400u64 {
+            let pose = DevicePose { direction: direction.into(), ..pose(at) };
+            let (now_ns, tissue) = (n * 1_000_000, Some(&tissue));
+            after = Some(core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue, epoch: 0, tissue_age_s: 0.0, release: false }));
+        }
+        let after = after.unwrap();
+        let change = V3::from(after.force_n) - V3::from(before.force_n);
+        assert!(change.norm() < 0.02 * before.force_n[2], "{} balls: {before:?} and {after:?}", shape.nodes().len());
+        assert_eq!(after.nodes, before.nodes);
+    }
+}
+
+/// One pose in mid-press that is not vouched for, and turned elsewhere: the tool is not turned by it.
+#[test]
+fn a_pose_that_is_not_valid_does_not_turn_the_tool() {
+    let tissue = wall();
+    let mut core = HapticCore::new(config(ToolShape::capsule(3.0, 40.0)));
+    let before = lowered(&mut core, &tissue, V3::new(0.0, 0.0, 1.0), V3::x());
+    for n in 0..300u64 {
+        let wrong = n < 4;
+        core.set_orientation(if wrong { [0.0, 0.0, 0.0, 1.0] } else { [0.0, 0.5f64.sqrt(), 0.0, 0.5f64.sqrt()] });
+        let direction = if wrong { [0.0, 0.0, 1.0] } else { [1.0, 0.0, 0.0] };
+        let pose = DevicePose { direction, valid: !wrong, ..pose(V3::new(0.0, 0.0, 1.0)) };
+        let (now_ns, tissue) = ((400 + n) * 1_000_000, Some(&tissue));
+        let out = core.tick(&TickInputs { now_ns, pose, pose_age_s: 0.0, tissue, epoch: 0, tissue_age_s: 0.0, release: false });
+        if n == 299 {
+            assert_eq!(out.nodes, before.nodes);
+            assert!((out.force_n[2] - before.force_n[2]).abs() < 1e-3 && out.faults.jumps == 0, "{before:?} {out:?}");
+        }
+    }
+}

@@ -17,7 +17,7 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
-        mpsc::sync_channel,
+        mpsc::{Receiver, RecvTimeoutError, sync_channel},
     },
     thread::{self, JoinHandle},
     time::{Duration, Instant},
@@ -34,6 +34,8 @@ pub const RETRY: Duration = Duration::from_millis(100);
 const LET_GO: Duration = Duration::from_millis(500);
 /// Sentences that wait for somebody to take them; more are left out.
 const UNHEARD: usize = 32;
+/// A device that is there and has not ended an exchange for this long is said to be stuck.
+const STUCK: Duration = Duration::from_secs(1);
 /// Most sentences in a second about whether a device is ready.
 const OFTEN: u32 = 4;
 /// Exchanges without an orientation, from a device that told one, after which that is said.
@@ -61,6 +63,8 @@ pub struct Report {
     pub taken_ns: u64,
     /// what the device warns of, in its maker's code; 0: nothing
     pub warning: u64,
+    /// part of the command that was not given to it, 0 to 1: the driver held it back
+    pub withheld: f64,
 }
 
 impl Report {
@@ -119,7 +123,7 @@ struct Shared {
     /// exchanges so far, and those that came late
     exchanges: AtomicU64,
     late: AtomicU64,
-    /// part of the force that is given on the way back from a silence, as the bits of an f64
+    /// part of the force that is given on the way back from a silence, and by a driver that holds some of it back, as the bits of an f64
     share: AtomicU64,
 }
 
@@ -169,7 +173,8 @@ impl RemoteDevice {
         });
         let for_thread = Arc::clone(&shared);
         let (sender, sentences) = sync_channel::<String>(UNHEARD);
-        thread::Builder::new().name("device's word".into()).spawn(move || sentences.iter().for_each(|sentence| tell(&sentence)))?;
+        let for_word = Arc::clone(&shared);
+        thread::Builder::new().name("device's word".into()).spawn(move || say(&sentences, &for_word, profile.name, &tell))?;
         let serve = move || {
             // a command that waits for a time slice is felt as a tick that came late
             drop(enter_realtime(priority, None));
@@ -286,6 +291,32 @@ impl Drop for RemoteDevice {
     }
 }
 
+/// Passes on what the device's thread has to say, and says that it is stuck where it cannot: a call into a library that does not return.
+fn say(sentences: &Receiver<String>, shared: &Shared, name: &str, tell: &dyn Fn(&str)) {
+    let (mut seen, mut since, mut stuck) = (0, Instant::now(), false);
+    loop {
+        match sentences.recv_timeout(STUCK / 4) {
+            Ok(sentence) => tell(&sentence),
+            Err(RecvTimeoutError::Disconnected) => return,
+            Err(RecvTimeoutError::Timeout) => {}
+        }
+        let exchanges = shared.exchanges.load(Relaxed);
+        if exchanges != seen || !shared.connected.load(Relaxed) {
+            if std::mem::take(&mut stuck) && exchanges != seen {
+                tell(&format!("the device ({name}) answers again"));
+            }
+            (seen, since) = (exchanges, Instant::now());
+        } else if !stuck && since.elapsed() > STUCK {
+            stuck = true;
+            shared.late.fetch_add(1, Relaxed);
+            tell(&format!(
+                "the device ({name}) has not answered for a second: its library or service holds the call, and the device may keep its last force; \
+                 switch it off, and on again"
+            ));
+        }
+    }
+}
+
 /// Closes the device however the thread ends.
 struct Opened<'a, D: Driver>(&'a mut D, &'a Shared);
 
@@ -395,7 +426,8 @@ fn serve(mut driver: impl Driver, shared: &Shared, profile: &DeviceProfile, tell
                 warned.push(report.warning);
             }
             shared.exchanges.fetch_add(1, Relaxed);
-            shared.share.store(guard.borrow().share().to_bits(), Relaxed);
+            let given = guard.borrow().share() * (1.0 - report.withheld.clamp(0.0, 1.0));
+            shared.share.store(given.to_bits(), Relaxed);
             let late = last_ns.replace(report.taken_ns).is_some_and(|last| report.taken_ns - last > LATE_NS);
             shared.late.fetch_add(u64::from(late), Relaxed);
         }
@@ -448,6 +480,37 @@ mod tests {
         }
 
         fn close(&mut self) {}
+    }
+
+    /// A device whose eleventh exchange takes a while.
+    struct Stuck(u64);
+
+    impl Driver for Stuck {
+        fn open(&mut self) -> Result<(), DeviceError> {
+            Ok(())
+        }
+
+        fn exchange(&mut self, _: &dyn Fn() -> Command) -> Result<Report, DeviceError> {
+            self.0 += 1;
+            thread::sleep(if self.0 == 11 { STUCK * 2 } else { Duration::from_millis(1) });
+            Ok(Report { ready: 1, withheld: 0.75, ..Report::zeroed() })
+        }
+
+        fn close(&mut self) {}
+    }
+
+    #[test]
+    fn a_call_that_does_not_return_is_told_and_counted_and_what_a_driver_holds_back_too() {
+        let (sender, told) = std::sync::mpsc::channel();
+        let tell = move |sentence: &str| drop(sender.send(sentence.to_owned()));
+        let device = RemoteDevice::start_telling(Stuck(0), TOUCH, Mounting::default(), 0, tell).unwrap();
+        let wait = Duration::from_secs(20);
+        assert!(told.recv_timeout(wait).unwrap().contains("has not answered for a second"));
+        assert!(device.exchanges() == 10 && device.late() > 0, "{} {}", device.exchanges(), device.late());
+        assert!(told.recv_timeout(wait).unwrap().contains("answers again"));
+        assert!(device.gives() > 0.0 && device.gives() <= 0.25, "{}", device.gives());
+        drop(device);
+        assert_eq!(told.iter().count(), 0);
     }
 
     #[test]

@@ -133,6 +133,7 @@ impl Driver for Touch {
             ready: 1,
             has_velocity: u64::from(placed),
             warning: if warns { frame.error.into() } else { 0 },
+            withheld: 1.0 - share,
             ..Report::zeroed()
         })
     }

@@ -76,3 +76,13 @@ impl Driver {
         })
     }
 }
+
+/// Numbers from a seed: a linear congruential generator.
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn within(&mut self, low: f64, high: f64) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        low + (high - low) * (self.0 >> 33) as f64 / (1u64 << 31) as f64
+    }
+}
