@@ -115,6 +115,8 @@ pub(crate) struct Node {
     gap: f64,
     last_point: Option<V3>,
     last_normal: V3,
+    /// the ball's centre at the last tick
+    last_centre: Option<V3>,
     material: Option<Material>,
     /// at the last tick [N]
     last_force: V3,
@@ -149,6 +151,7 @@ impl Node {
             gap: 0.0,
             last_point: None,
             last_normal: V3::zeros(),
+            last_centre: None,
             material: None,
             last_force: V3::zeros(),
             bridge: Bridge { difference: V3::zeros(), left: 0.0, duration_s: 1.0 },
@@ -190,6 +193,7 @@ impl Node {
     ) -> Felt {
         let radius = self.proxy.radius_mm();
         let was_felt = self.last_point.is_some();
+        let came = self.last_centre.replace(x).map_or(V3::zeros(), |last| last - x);
         if now.jumped {
             self.proxy.reset();
             self.end_contact();
@@ -213,9 +217,10 @@ impl Node {
         if self.last_point.is_some() {
             let change = before.filter(|_| blend.is_some()).map(|before| before - d);
             self.carry(change, now, d, point);
-        } else if moved || now.committed || now.other_surface {
-            // already pressed where it is found first, or met by tissue that came: felt gradually, but for what the hand's own motion did
-            let own = before.filter(|_| !moved).unwrap_or(0.0).max(0.0);
+        } else if moved || now.committed || now.other_surface || before.is_none() {
+            // already pressed where it is found first (or again, after a tick without a foot), or met by tissue that came: felt gradually, but for what
+            // the hand's own motion did
+            let own = if moved { 0.0 } else { before.unwrap_or_else(|| came.dot(&normal)).max(0.0) };
             *(if now.committed || now.other_surface { &mut self.bias } else { &mut self.leapt }) = -(d - own).max(0.0);
         }
         let delta = (d + self.give_way + self.bias + self.leapt).max(0.0);
