@@ -5,7 +5,7 @@ mod common;
 
 use common::{body, difference, gpu, gpu_of};
 use maille_contract::{Role, control::PIN_IDLE};
-use maille_raycast::{Camera, Extras, Picture, Preset, Settings, Skip, render};
+use maille_raycast::{Camera, Extras, Picture, Preset, Probe, Settings, Skip, Ultrasound, render, ultrasound};
 use maille_raycast_gpu::{Choice, Gpu, GpuError, Placement, Renderer};
 use maille_store::{Reader, StoreKeeper, StoreSizes, Writer};
 use maille_transport::{ControlMap, Domain};
@@ -103,6 +103,53 @@ fn in_place_nothing_is_uploaded_and_commits_are_seen() {
         assert!(n > 0 || difference(&before, &after).0 > 0.01, "the commit is not to be seen");
     }
     assert!(world.free());
+}
+
+/// A probe on the skin.
+fn probe(source: &impl BrickSource) -> Ultrasound {
+    let centre = source.info().grid.center();
+    let face = std::array::from_fn(|c| centre[c] - [14.0, 15.0, -10.0][c]);
+    Ultrasound::new(Probe { depth_mm: 50.0, ..Probe::convex(face, [14.0, 15.0, -10.0], [1.0, -1.0, 0.3]) })
+}
+
+#[test]
+fn an_ultrasound_fan_reads_voxels_in_place_and_sees_commits() {
+    let Some(gpu) = gpu() else { return };
+    let mut world = World::new();
+    let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::Auto).unwrap();
+    let in_place = renderer.placement() == Placement::InPlace;
+    let mut draw = |world: &World| {
+        let snapshot = world.reader.snapshot();
+        let (mut cpu, mut gpu) = (Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]));
+        ultrasound(&snapshot, &probe(&snapshot), None, &mut cpu).unwrap();
+        let report = renderer.ultrasound(&snapshot, &probe(&snapshot), None, &mut gpu).unwrap();
+        let (share, worst) = difference(&cpu, &gpu);
+        assert!(share <= 0.001, "{share} of pixels, at most {worst}");
+        (gpu, report)
+    };
+    let (before, first) = draw(&world);
+    let (same, second) = draw(&world);
+    assert!(first.built && !second.built && same == before);
+    assert_eq!((second.traffic.changed, second.traffic.uploaded, second.traffic.other), (0, 0, 0), "nothing changed and nothing is sent");
+    world.change(&[20, 21, 26]);
+    let (after, third) = draw(&world);
+    assert!(difference(&before, &after).0 > 0.01, "the commit is not to be seen");
+    assert_eq!(third.traffic.changed, 3);
+    if in_place {
+        assert_eq!([first, second, third].map(|r| (r.traffic.uploaded, r.traffic.fetched)), [(0, 0); 3]);
+    }
+    assert!(world.free());
+    // its buffers come back when they are asked for again
+    renderer.forget_ultrasound();
+    let snapshot = world.reader.snapshot();
+    let mut again = Picture::new(SIZE[0], SIZE[1]);
+    renderer.ultrasound(&snapshot, &probe(&snapshot), None, &mut again).unwrap();
+    assert_eq!(again, after);
+    renderer.gpu().give_up();
+    let untouched = again.clone();
+    let lost = renderer.ultrasound(&snapshot, &probe(&snapshot), None, &mut again);
+    assert!(matches!(lost, Err(GpuError::Lost(_))), "{lost:?}");
+    assert_eq!(again, untouched);
 }
 
 #[test]
