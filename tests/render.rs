@@ -195,6 +195,11 @@ fn the_gpu_draws_what_the_cpu_draws_and_without_one_it_is_said() {
     let (_, _, cpu) = picture(&volume, &out, &asked[..2]);
     let far = cpu.iter().zip(&gpu).filter(|(a, b)| a.abs_diff(**b) > 2).count();
     assert!(far * 200 <= cpu.len() && cpu.iter().any(|&v| v > 20), "{far} of {} bytes differ", cpu.len());
+    let probe = ["--view=ultrasound", "--eye=0,-22,0", "--target=0,0,0", "--depth=40", "--size=90x70"];
+    let (_, _, gpu) = picture(&volume, &out, &[&probe[..], &["--backend=gpu"]].concat());
+    let (_, _, cpu) = picture(&volume, &out, &probe);
+    let far = cpu.iter().zip(&gpu).filter(|(a, b)| a.abs_diff(**b) > 2).count();
+    assert!(far * 1000 <= cpu.len() && cpu.iter().any(|&v| v > 20), "ultrasound: {far} of {} bytes differ", cpu.len());
 }
 
 #[test]

@@ -221,8 +221,16 @@ pub fn run(args: &Args) -> Outcome {
         None if args.view == View::Ultrasound => {
             let fan = fan(args, scene.as_ref(), &bricks)?;
             let mut outcome = Ok(());
-            let times = timed(frames, || outcome = pool.install(|| ultrasound(&bricks, &fan, warp, &mut picture)));
-            outcome.map_err(Failure::Usage)?;
+            let times = timed(frames, || match &mut gpu {
+                None => outcome = pool.install(|| ultrasound(&bricks, &fan, warp, &mut picture)).map_err(Failure::Usage),
+                Some(gpu) => {
+                    outcome = gpu.ultrasound(&bricks, &fan, warp, &mut picture).map(drop).map_err(|e| match e {
+                        GpuError::Render(fault) => Failure::Usage(fault.to_string()),
+                        other => refused(&other),
+                    });
+                }
+            });
+            outcome?;
             times
         }
         None => {

@@ -1,10 +1,12 @@
 //! Who draws: the ray caster on the CPU, or, where the scene says `backend = "gpu"`, its twin, for as long as there is one.
 //!
-//! The twin draws the 3D view and the sections; ultrasound stays on the CPU. Whatever it cannot do, the CPU does in the same frame: no
+//! The twin draws the 3D view, the sections, the radiograph and ultrasound. Whatever it cannot do, the CPU does in the same frame: no
 //! device at the start, one that is lost, out of memory or silent for [`PATIENCE`] (then it is given up for the rest of the process's life), or a
 //! picture that it cannot draw (then it is asked again for the next one). Each is said once on standard error and counted for the report.
 
-use maille_raycast::{Camera, Extras, Overlay, Picture, RenderError, Section, Settings, Skip, render_extra, section_with};
+use maille_raycast::{
+    Camera, Extras, Overlay, Picture, RenderError, Section, Settings, Skip, Ultrasound, Warp, render_extra, section_with, ultrasound,
+};
 use maille_raycast_gpu::{Choice, Gpu, GpuError, Placement, Renderer};
 use maille_scene::{Backend as Asked, Scene};
 use maille_store::Reader;
@@ -90,6 +92,31 @@ impl Backend {
             }
         }
         section_with(source, section, overlay, picture);
+    }
+
+    /// An ultrasound fan; a sentence where there is none to draw.
+    pub fn ultrasound(
+        &mut self,
+        source: &impl BrickSource,
+        settings: &Ultrasound,
+        warp: Option<&Warp>,
+        picture: &mut Picture,
+    ) -> Result<(), String> {
+        if let Some(gpu) = &mut self.gpu {
+            match gpu.ultrasound(source, settings, warp, picture) {
+                Ok(_) => return Ok(()),
+                Err(GpuError::Render(fault)) => return Err(fault.to_string()),
+                Err(reason) => self.failed(&reason),
+            }
+        }
+        ultrasound(source, settings, warp, picture)
+    }
+
+    /// Ultrasound is switched off: what the device kept for it is given back.
+    pub fn forget_ultrasound(&mut self) {
+        if let Some(gpu) = &mut self.gpu {
+            gpu.forget_ultrasound();
+        }
     }
 
     fn failed(&mut self, reason: &GpuError) {

@@ -7,7 +7,7 @@ use maille_contract::{
 };
 use maille_raycast::{
     Camera, Capsule, Extras, Geometry, Overlay, Picture, Plane, Quality, RenderError, Section, Settings, Skip, Step, Ultrasound, Warp,
-    WarpScheme as Rays, render_extra, resampled, ultrasound,
+    WarpScheme as Rays, render_extra, resampled,
 };
 use maille_scene::{Scene, WarpScheme, registry};
 use maille_transport::{Stopwatch, monotonic_ns};
@@ -89,6 +89,9 @@ impl Composer {
             let on = scene.has_effect(name) && !registry::place(name).is_some_and(|place| switches.is_off(place));
             let [w, h] = if on { scene.rendering.section_size } else { [0, 0] };
             pictures.iter_mut().filter(|p| [p.width, p.height] != [w, h]).for_each(|p| *p = Picture::new(w, h));
+        }
+        if self.pictures[4].width == 0 {
+            self.backend.forget_ultrasound();
         }
         if self.pictures[5].width == 0 {
             self.skip_xray = None;
@@ -180,7 +183,8 @@ impl Composer {
         }
         watch.split("sections");
         if fan.width > 0 {
-            let drawn = tool.is_some_and(|tool| ultrasound(source, &Ultrasound::new(overlay::probe(tool)), warp, fan).is_ok());
+            let settings = tool.map(|tool| Ultrasound::new(overlay::probe(tool)));
+            let drawn = settings.is_some_and(|settings| self.backend.ultrasound(source, &settings, warp, fan).is_ok());
             if !drawn {
                 // no probe, or one that looks nowhere
                 fan.rgb.fill(0);

@@ -1,7 +1,13 @@
 //! Frames by the twin on a GPU: those of the CPU but for rounding; and a device that goes away, or was never there, costs no frame.
 
 use crate::{backend::Backend, compose::Composer, in_place::World};
-use maille_scene::Backend as Asked;
+use bytemuck::Zeroable;
+use maille_contract::{FrameHeader, Switches, ToolState};
+use maille_raycast::{Motion, Warp, WarpOptions};
+use maille_scene::{Backend as Asked, EffectSetting, registry};
+use maille_store::Snapshot;
+use maille_transport::Untimed;
+use maille_volume::{BrickSource, VectorField};
 
 /// A world whose scene asks for a GPU, and a composer that has one; without any a sentence, or under CI a failure.
 fn with_gpu() -> Option<(World, Composer)> {
@@ -40,6 +46,61 @@ fn a_frame_by_the_gpu_is_the_cpus_and_one_whose_device_is_lost_is_drawn_by_the_c
         assert!(world.draw(&mut composer, &snapshot) == by_cpu, "{said}");
         assert_eq!(composer.backend.end(), (false, failures), "{said}");
     }
+    assert!(composer.backend.gpu().is_none());
+}
+
+/// A frame with a probe on the ball, and of its pictures the fan alone.
+fn with_probe(world: &World, composer: &mut Composer, snapshot: &Snapshot<'_>, warp: Option<&Warp>) -> [Vec<u8>; 2] {
+    let mut tool = ToolState::zeroed();
+    (tool.tip_mm, tool.proxy_mm, tool.direction, tool.radius_mm) = ([31.0, 2.0, 30.0], [31.0, 2.0, 30.0], [0.0, 1.0, 0.1], 2.0);
+    composer.draw(snapshot, warp, &world.view(), Some(&tool), true, None, &mut Untimed).unwrap();
+    let mut pixels = vec![0; composer.bytes()];
+    composer.write(&mut pixels, FrameHeader::default());
+    [pixels, composer.pictures[4].rgb.clone()]
+}
+
+#[test]
+fn ultrasound_is_the_gpus_too_through_breath_and_without_and_the_cpus_when_it_is_lost_in_its_frame() {
+    let Some((mut world, mut composer)) = with_gpu() else { return };
+    world.scene.effects.insert("ultrasound".into(), EffectSetting::Switch(true));
+    let backend = std::mem::take(&mut composer.backend);
+    composer = Composer::new(&world.scene);
+    composer.backend = backend;
+    let mut by_cpu = Composer::new(&world.scene);
+    let snapshot = world.reader.snapshot();
+    let mut field = VectorField::zeros(snapshot.info().grid.clone());
+    field.vectors.iter_mut().enumerate().for_each(|(n, v)| *v = [0.0, 3.0 * (n as f32 / 262_144.0 * 3.0).sin(), 1.0]);
+    let mut warp = Warp::new(snapshot.info(), WarpOptions::default());
+    warp.update(snapshot.info(), &Motion::single(&field).unwrap(), &[1.0]).unwrap();
+    for warp in [None, Some(&warp)] {
+        let ([whole, fan], [cpu, cpu_fan]) =
+            (with_probe(&world, &mut composer, &snapshot, warp), with_probe(&world, &mut by_cpu, &snapshot, warp));
+        assert_eq!(composer.backend.end(), (true, 0), "all pictures of the frame are the GPU's");
+        let (all, own) = (far(&cpu, &whole), far(&cpu_fan, &fan));
+        println!("{:.4} % of bytes differ by more than 2, {:.4} % of the fan's", 100.0 * all, 100.0 * own);
+        assert!(all <= 0.001 && own <= 0.001, "{all}, {own}");
+        assert!(fan.iter().filter(|&&v| v > 40).count() > 300, "an echo is seen");
+    }
+    // switched off and on again it is the same
+    let [before, _] = with_probe(&world, &mut composer, &snapshot, None);
+    let mut switches: Switches = Zeroable::zeroed();
+    for on in [false, true] {
+        switches.switch(registry::place("ultrasound").unwrap(), on);
+        composer.switch(&world.scene, &switches);
+    }
+    assert!(with_probe(&world, &mut composer, &snapshot, None)[0] == before);
+    // only the fan is asked for in the frame in which the device goes away
+    let [_, expected] = with_probe(&world, &mut by_cpu, &snapshot, None);
+    composer.backend.begin();
+    composer.backend.gpu().unwrap().give_up();
+    let mut tool = ToolState::zeroed();
+    (tool.proxy_mm, tool.direction) = ([31.0, 2.0, 30.0], [0.0, 1.0, 0.1]);
+    let settings = maille_raycast::Ultrasound::new(crate::overlay::probe(&tool));
+    let mut picture = by_cpu.pictures[4].clone();
+    picture.rgb.fill(7);
+    composer.backend.ultrasound(&snapshot, &settings, None, &mut picture).unwrap();
+    assert!(picture.rgb == expected, "bit for bit the CPU's");
+    assert_eq!(composer.backend.end(), (false, 1));
     assert!(composer.backend.gpu().is_none());
 }
 

@@ -125,7 +125,7 @@ impl World {
         Self { domain, _control: control, _keeper: keeper, reader, scene }
     }
 
-    fn view(&self) -> View {
+    pub fn view(&self) -> View {
         View::new(&self.scene, &BoxMm::of(&self.reader.info().grid)).unwrap()
     }
 

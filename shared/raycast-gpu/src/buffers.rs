@@ -47,6 +47,25 @@ impl Mirror {
     }
 }
 
+/// A buffer that shaders fill for other shaders.
+#[derive(Default)]
+pub(crate) struct Scratch(Option<wgpu::Buffer>);
+
+impl Scratch {
+    /// Room for as many bytes, a multiple of four.
+    pub fn room(&mut self, device: &wgpu::Device, size: u64) {
+        if self.0.as_ref().is_none_or(|b| b.size() != size) {
+            let usage = wgpu::BufferUsages::STORAGE;
+            self.0 = Some(device.create_buffer(&wgpu::BufferDescriptor { label: None, size, usage, mapped_at_creation: false }));
+        }
+    }
+
+    /// The buffer, once there was room.
+    pub fn buffer(&self) -> Option<&wgpu::Buffer> {
+        self.0.as_ref()
+    }
+}
+
 /// A buffer that shaders write and the CPU reads back.
 #[derive(Default)]
 pub(crate) struct Answer {

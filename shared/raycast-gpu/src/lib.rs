@@ -2,8 +2,8 @@
 //!
 //! The mental model: [`Gpu::open`] finds a device; a [`Renderer`] belongs to one volume, whose bricks lie where [`Placement`] says; it
 //! draws with the reference's own [`Camera`](maille_raycast::Camera), [`Settings`](maille_raycast::Settings),
-//! [`Skip`](maille_raycast::Skip), [`Extras`](maille_raycast::Extras) and [`Section`](maille_raycast::Section) into its
-//! [`Picture`](maille_raycast::Picture). All numbers of a frame come from `maille_raycast::twin`, so that twins cannot drift apart.
+//! [`Skip`](maille_raycast::Skip), [`Extras`](maille_raycast::Extras), [`Section`](maille_raycast::Section) and
+//! [`Ultrasound`](maille_raycast::Ultrasound) into its [`Picture`](maille_raycast::Picture). All numbers of a frame come from `maille_raycast::twin`, so that twins cannot drift apart.
 //!
 //! Voxels (DESIGN D8). *In place* (unified memory, software Vulkan): the store's segments are imported as buffers and nothing of them is
 //! uploaded; a small index brick → slot follows the commits. *Resident* (a GPU with memory of its own): bricks lie there, and changed
@@ -28,11 +28,12 @@ mod import;
 mod labels;
 mod render;
 mod section;
+mod ultrasound;
 mod variant;
 mod voxels;
 mod warp;
 
 pub use device::{Choice, Gpu, GpuError};
 pub use render::{FrameReport, Pending, Renderer};
-pub use variant::{Shows, Variant};
+pub use variant::{Shows, Stage, Variant};
 pub use voxels::{Placement, Traffic};

@@ -5,7 +5,8 @@ use crate::{
     device::{Gpu, GpuError},
     frame::Packed,
     labels::LabelMap,
-    variant::{FAR, Shows, VOXELS_BINDING, Variant},
+    ultrasound::Fan,
+    variant::{FAR, Shows, Stage, VOXELS_BINDING, Variant},
     voxels::{Placement, Traffic, Voxels},
     warp::Lattice,
 };
@@ -26,6 +27,20 @@ pub struct FrameReport {
     pub built: bool,
 }
 
+/// A shader and how much of it: a picture is one, or several in a row.
+pub(crate) struct Pass {
+    pub variant: Variant,
+    /// workgroups
+    pub groups: [u32; 2],
+}
+
+impl Pass {
+    /// An invocation for each of as many things across and down.
+    pub fn over(variant: Variant, counts: [usize; 2]) -> Self {
+        Self { variant, groups: counts.map(|n| n.div_ceil(GROUP) as u32) }
+    }
+}
+
 /// Draws one volume on one device.
 pub struct Renderer {
     pub(crate) gpu: Gpu,
@@ -38,6 +53,7 @@ pub struct Renderer {
     solids: Mirror,
     lattice: Lattice,
     labels: LabelMap,
+    pub(crate) fan: Fan,
     pub(crate) colors: Answer,
     depths: Answer,
     pub(crate) traffic: Traffic,
@@ -85,6 +101,7 @@ impl Renderer {
             solids: Mirror::default(),
             lattice: Lattice::default(),
             labels: LabelMap::default(),
+            fan: Fan::default(),
             colors: Answer::default(),
             depths: Answer::default(),
             traffic: Traffic::default(),
@@ -188,7 +205,7 @@ impl Renderer {
             barrel: extras.barrel > 0.0,
             ..Variant::of(shows)
         };
-        self.frame(variant, source, size, |this, traffic| {
+        self.frame(&[Pass::over(variant, size)], source, size, |this, traffic| {
             let (device, queue) = (&this.gpu.device, &this.gpu.queue);
             let storage = wgpu::BufferUsages::STORAGE;
             let packed = Packed::new(&numbers, settings, size);
@@ -214,21 +231,21 @@ impl Renderer {
         })
     }
 
-    /// One picture of a variant, after what `prepare` sends.
+    /// One picture by passes, after what `prepare` sends.
     pub(crate) fn frame<S: BrickSource + ?Sized>(
         &mut self,
-        variant: Variant,
+        passes: &[Pass],
         source: &S,
         size: [usize; 2],
         prepare: impl FnOnce(&mut PartsMut<'_>, &mut Traffic),
     ) -> Result<(wgpu::SubmissionIndex, FrameReport), GpuError> {
         let mut report = FrameReport::default();
-        let outcome = self.try_frame(variant, source, size, prepare, &mut report);
+        let outcome = self.try_frame(passes, source, size, prepare, &mut report);
         if outcome.is_err() {
             // nothing of what the device has is certain now
             self.voxels.forget();
             (self.numbers, self.distances, self.table, self.solids) = Default::default();
-            (self.lattice, self.labels, self.colors, self.depths) = Default::default();
+            (self.lattice, self.labels, self.fan, self.colors, self.depths) = Default::default();
         }
         let t = report.traffic;
         self.traffic.uploaded += t.uploaded;
@@ -240,70 +257,46 @@ impl Renderer {
 
     fn try_frame<S: BrickSource + ?Sized>(
         &mut self,
-        variant: Variant,
+        passes: &[Pass],
         source: &S,
         size: [usize; 2],
         prepare: impl FnOnce(&mut PartsMut<'_>, &mut Traffic),
         report: &mut FrameReport,
     ) -> Result<wgpu::SubmissionIndex, GpuError> {
-        if !self.pipelines.contains_key(&variant) {
-            let pipeline = self.build(variant)?;
-            self.pipelines.insert(variant, pipeline);
-            report.built = true;
+        for Pass { variant, .. } in passes {
+            if !self.pipelines.contains_key(variant) {
+                let pipeline = self.build(*variant)?;
+                self.pipelines.insert(*variant, pipeline);
+                report.built = true;
+            }
         }
-        let Self { gpu, voxels, pipelines, numbers, distances, table, solids, lattice, labels, colors, depths, .. } = self;
+        let depth = passes.iter().any(|pass| pass.variant.depth);
+        let Self { gpu, voxels, pipelines, numbers, distances, table, solids, lattice, labels, fan, colors, depths, .. } = self;
         let gpu = &*gpu;
         gpu.checked(|| {
             let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
             voxels.follow(gpu, source, &mut encoder, &mut report.traffic)?;
             colors.room(&gpu.device, (4 * size[0] * size[1]) as u64);
-            let mut parts = PartsMut { gpu, numbers, distances, table, solids, lattice, labels, depths };
+            let mut parts = PartsMut { gpu, numbers, distances, table, solids, lattice, labels, fan, depths };
             prepare(&mut parts, &mut report.traffic);
-            let mut bindings = vec![(0, numbers.buffer()), (1, colors.written()), (3, voxels.index())];
-            if variant.depth {
-                bindings.push((2, depths.written()));
-            }
-            if variant.shows != Shows::Section {
-                bindings.push((4, distances.buffer()));
-            }
-            if variant.warp {
-                bindings.extend(lattice.bindings());
-            }
-            if variant.labels {
-                bindings.extend(labels.bindings());
-            }
-            if matches!(variant.shows, Shows::Volume | Shows::Both) {
-                bindings.push((10, table.buffer()));
-            }
-            if variant.ends {
-                bindings.push((11, solids.buffer()));
-            }
-            bindings.extend((VOXELS_BINDING..).zip(voxels.buffers().map(Some)));
-            let mut entries = Vec::with_capacity(bindings.len());
-            for (binding, buffer) in bindings {
-                let buffer = buffer.ok_or_else(|| GpuError::Unsupported(format!("nothing for binding {binding}")))?;
-                if buffer.size() > gpu.limits.max_storage_buffer_binding_size {
-                    let mib = gpu.limits.max_storage_buffer_binding_size >> 20;
-                    return Err(GpuError::Unsupported(format!("its shaders see at most {mib} MiB at once: a map or the picture has more")));
-                }
-                entries.push(wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() });
-            }
-            let pipeline = &pipelines[&variant];
-            let layout = pipeline.get_bind_group_layout(0);
-            let group = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout: &layout, entries: &entries });
+            let bound = Bound { voxels, numbers, distances, table, solids, lattice, labels, fan, colors, depths };
+            let groups =
+                passes.iter().map(|pass| bound.group(gpu, &pass.variant, &pipelines[&pass.variant])).collect::<Result<Vec<_>, _>>()?;
             {
-                let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-                pass.set_pipeline(pipeline);
-                pass.set_bind_group(0, &group, &[]);
-                pass.dispatch_workgroups(size[0].div_ceil(GROUP) as u32, size[1].div_ceil(GROUP) as u32, 1);
+                let mut compute = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                for (Pass { variant, groups: [across, down] }, group) in passes.iter().zip(&groups) {
+                    compute.set_pipeline(&pipelines[variant]);
+                    compute.set_bind_group(0, group, &[]);
+                    compute.dispatch_workgroups(*across, *down, 1);
+                }
             }
             colors.fetch(&mut encoder);
-            if variant.depth {
+            if depth {
                 depths.fetch(&mut encoder);
             }
             let submission = gpu.queue.submit([encoder.finish()]);
             colors.map();
-            if variant.depth {
+            if depth {
                 depths.map();
             }
             Ok(submission)
@@ -360,7 +353,87 @@ pub(crate) struct PartsMut<'a> {
     pub solids: &'a mut Mirror,
     pub lattice: &'a mut Lattice,
     pub labels: &'a mut LabelMap,
+    pub fan: &'a mut Fan,
     pub depths: &'a mut Answer,
+}
+
+/// What shaders are given.
+struct Bound<'a> {
+    voxels: &'a Voxels,
+    numbers: &'a Mirror,
+    distances: &'a Mirror,
+    table: &'a Mirror,
+    solids: &'a Mirror,
+    lattice: &'a Lattice,
+    labels: &'a LabelMap,
+    fan: &'a Fan,
+    colors: &'a Answer,
+    depths: &'a Answer,
+}
+
+impl Bound<'_> {
+    /// Of this, what a variant asks for.
+    fn group(&self, gpu: &Gpu, variant: &Variant, pipeline: &wgpu::ComputePipeline) -> Result<wgpu::BindGroup, GpuError> {
+        let mut bindings = match variant.shows {
+            Shows::Ultrasound(stage) => self.of_fan(stage, variant.speckle),
+            _ => self.of_picture(variant),
+        };
+        if variant.warp {
+            bindings.extend(self.lattice.bindings());
+        }
+        if variant.samples() {
+            bindings.push((3, self.voxels.index()));
+            bindings.extend((VOXELS_BINDING..).zip(self.voxels.buffers().map(Some)));
+        }
+        let mut entries = Vec::with_capacity(bindings.len());
+        for (binding, buffer) in bindings {
+            let buffer = buffer.ok_or_else(|| GpuError::Unsupported(format!("nothing for binding {binding}")))?;
+            if buffer.size() > gpu.limits.max_storage_buffer_binding_size {
+                let mib = gpu.limits.max_storage_buffer_binding_size >> 20;
+                return Err(GpuError::Unsupported(format!("its shaders see at most {mib} MiB at once: a map or the picture has more")));
+            }
+            entries.push(wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() });
+        }
+        let layout = pipeline.get_bind_group_layout(0);
+        Ok(gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout: &layout, entries: &entries }))
+    }
+
+    fn of_picture(&self, variant: &Variant) -> Vec<(u32, Option<&wgpu::Buffer>)> {
+        let mut bindings = vec![(0, self.numbers.buffer()), (1, self.colors.written())];
+        if variant.depth {
+            bindings.push((2, self.depths.written()));
+        }
+        if variant.shows != Shows::Section {
+            bindings.push((4, self.distances.buffer()));
+        }
+        if variant.labels {
+            bindings.extend(self.labels.bindings());
+        }
+        if matches!(variant.shows, Shows::Volume | Shows::Both) {
+            bindings.push((10, self.table.buffer()));
+        }
+        if variant.ends {
+            bindings.push((11, self.solids.buffer()));
+        }
+        bindings
+    }
+
+    fn of_fan(&self, stage: Stage, speckle: bool) -> Vec<(u32, Option<&wgpu::Buffer>)> {
+        let fan = self.fan;
+        let (ways, weights) = ((12, fan.ways.buffer()), (13, fan.weights.buffer()));
+        let (tissues, greys, places) = ((7, fan.tissues.buffer()), (14, fan.greys.buffer()), (15, fan.places.buffer()));
+        let mut bindings = vec![(0, fan.numbers.buffer())];
+        match stage {
+            Stage::Gather => bindings.extend([ways, tissues, places]),
+            Stage::Walk => bindings.extend([tissues, greys]),
+            Stage::Echo => bindings.extend([ways, tissues, greys, places]),
+            Stage::Pulse if speckle => bindings.extend([weights, tissues, places]),
+            Stage::Pulse => bindings.extend([tissues, places]),
+            Stage::Beam => bindings.extend([weights, greys, places]),
+            Stage::Scan => bindings.extend([greys, (1, self.colors.written())]),
+        }
+        bindings
+    }
 }
 
 impl<S> Pending<'_, S> {

@@ -2,7 +2,7 @@
 
 use crate::{
     device::GpuError,
-    render::{FrameReport, Renderer},
+    render::{FrameReport, Pass, Renderer},
     variant::{Shows, Variant},
 };
 use bytemuck::{Pod, Zeroable};
@@ -94,7 +94,8 @@ impl Renderer {
                 overlay: opaque_mm.is_some(),
                 ..Variant::of(Shows::Section)
             };
-            let (submission, report) = self.frame(variant, source, [width, height], |parts, traffic| {
+            let size = [width, height];
+            let (submission, report) = self.frame(&[Pass::over(variant, size)], source, size, |parts, traffic| {
                 let (device, queue) = (&parts.gpu.device, &parts.gpu.queue);
                 traffic.other += parts.numbers.follow(device, queue, wgpu::BufferUsages::UNIFORM, bytemuck::bytes_of(&packed));
                 if let Some(warp) = warp {

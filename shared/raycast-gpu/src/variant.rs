@@ -29,6 +29,25 @@ pub enum Shows {
     Xray,
     /// a flat section
     Section,
+    /// a part of the way to an ultrasound fan
+    Ultrasound(Stage),
+}
+
+/// Passes of an ultrasound fan, in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Stage {
+    /// tissue of every sample
+    Gather,
+    /// what of the sound comes down each line
+    Walk,
+    /// echoes of interfaces and scatterers
+    Echo,
+    /// over the pulse's length
+    Pulse,
+    /// over the beam's width, then grey
+    Beam,
+    /// pixels
+    Scan,
 }
 
 /// All that makes one shader another.
@@ -60,6 +79,8 @@ pub struct Variant {
     pub maximum: bool,
     /// the displacement over a section
     pub overlay: bool,
+    /// scatterers in an ultrasound fan
+    pub speckle: bool,
 }
 
 impl Variant {
@@ -79,7 +100,17 @@ impl Variant {
             slab: false,
             maximum: false,
             overlay: false,
+            speckle: false,
         }
+    }
+
+    fn is(&self, stage: Stage) -> bool {
+        self.shows == Shows::Ultrasound(stage)
+    }
+
+    /// Whether it looks at voxels.
+    pub(crate) fn samples(&self) -> bool {
+        !matches!(self.shows, Shows::Ultrasound(Stage::Walk | Stage::Pulse | Stage::Beam | Stage::Scan))
     }
 
     fn has(&self, word: &str) -> bool {
@@ -100,7 +131,14 @@ impl Variant {
             "XRAY" => self.shows == Shows::Xray,
             "TABLE" => matches!(self.shows, Shows::Volume | Shows::Both),
             "SURFACE" => matches!(self.shows, Shows::Isosurface | Shows::Both),
-            "RAYS" => self.shows != Shows::Section,
+            "RAYS" => !matches!(self.shows, Shows::Section | Shows::Ultrasound(_)),
+            "SPECKLE" => self.speckle,
+            "GATHER" => self.is(Stage::Gather),
+            "WALK" => self.is(Stage::Walk),
+            "ECHO" => self.is(Stage::Echo),
+            "PULSE" => self.is(Stage::Pulse),
+            "BEAM" => self.is(Stage::Beam),
+            "SCAN" => self.is(Stage::Scan),
             other => unreachable!("{other} is no word of a variant"),
         }
     }
@@ -111,20 +149,34 @@ impl Variant {
         if self.has("RAYS") {
             pieces.extend([include_str!("frame.wgsl"), include_str!("skip.wgsl")]);
         }
-        pieces.push(include_str!("voxels.wgsl"));
+        if self.samples() {
+            pieces.push(include_str!("voxels.wgsl"));
+        }
+        if self.shaded || self.is(Stage::Echo) {
+            pieces.push(include_str!("gradient.wgsl"));
+        }
         if self.warp {
             pieces.push(include_str!("warp.wgsl"));
         }
         if self.labels {
             pieces.push(include_str!("labels.wgsl"));
         }
-        match self.has("RAYS") {
-            true if self.shows == Shows::Xray => pieces.push(include_str!("scalar.wgsl")),
-            true => pieces.extend([include_str!("shade.wgsl"), include_str!("scalar.wgsl")]),
-            false => pieces.push(include_str!("section.wgsl")),
+        match self.shows {
+            Shows::Xray => pieces.push(include_str!("scalar.wgsl")),
+            Shows::Section => pieces.push(include_str!("section.wgsl")),
+            Shows::Ultrasound(_) => pieces.push(include_str!("ultrasound.wgsl")),
+            Shows::Volume | Shows::Isosurface | Shows::Both => pieces.extend([include_str!("shade.wgsl"), include_str!("scalar.wgsl")]),
         }
         let mut out = constants(layout);
-        words(&mut out, buffers);
+        if self.samples() {
+            words(&mut out, buffers);
+        }
+        if matches!(self.shows, Shows::Ultrasound(_)) {
+            echoes(&mut out);
+        }
+        if self.is(Stage::Gather) {
+            tissue(&mut out);
+        }
         for piece in pieces {
             self.keep(piece, &mut out);
         }
@@ -171,6 +223,31 @@ fn constants(layout: &BrickLayout) -> String {
     put(format!("const LOOKS: i32 = {looks};\nconst SHORTEST: f32 = {shortest:e};\nconst FOLDED: f32 = {folded:e};"));
     put(format!("const FAR: f32 = {FAR:e};\nconst NEARLY: f32 = {NEARLY:e};"));
     out
+}
+
+/// What an ultrasound fan goes by.
+fn echoes(out: &mut String) {
+    use maille_raycast::ultrasound::acoustic;
+    let mut put = |text: String| writeln!(out, "{text}").expect("a string takes all");
+    let (air, gas, faint, least_pass, least_echo) = maille_raycast::twin::ECHO;
+    put(format!("const AIR_HU: f32 = {air:e};\nconst GAS_HU: f32 = {gas:e};\nconst FAINT: f32 = {faint:e};"));
+    put(format!("const LEAST_PASS: f32 = {least_pass:e};\nconst LEAST_ECHO: f32 = {least_echo:e};"));
+    put(format!("const GEL: f32 = {:e};\nconst WEIGHTS: u32 = {}u;", acoustic(0.0).impedance, crate::ultrasound::ROW));
+}
+
+/// What values mean to sound, as straight pieces over HU.
+fn tissue(out: &mut String) {
+    use maille_raycast::ultrasound::TISSUES;
+    let mut put = |text: String| writeln!(out, "{text}").expect("a string takes all");
+    let vector = |v: [f64; 3]| format!("vec3<f32>({:e}, {:e}, {:e})", v[0], v[1], v[2]);
+    let row = |n: usize| [TISSUES[n].impedance, TISSUES[n].attenuation, TISSUES[n].scatter];
+    put(format!("fn acoustic(hu: f32) -> vec3<f32> {{\n    var v = {};", vector(row(0))));
+    for n in 1..TISSUES.len() {
+        let (from, wide) = (TISSUES[n - 1].hu, TISSUES[n].hu - TISSUES[n - 1].hu);
+        let rise = std::array::from_fn(|c| row(n)[c] - row(n - 1)[c]);
+        put(format!("    v += {} * clamp((hu - ({from:e})) / {wide:e}, 0.0, 1.0);", vector(rise)));
+    }
+    put("    return v;\n}".into());
 }
 
 /// Bindings of the voxels' buffers, and the function that reads a word of one of them.
@@ -227,6 +304,32 @@ mod tests {
             assert!(!code(&section).contains(absent), "{absent} in a section");
         }
         assert!(!code(&Variant::of(Shows::Xray).source(&layout, 1)).contains("table"));
+    }
+
+    #[test]
+    fn only_shaders_of_ultrasound_hold_ultrasound_and_each_only_its_own_pass() {
+        let layout = BrickLayout::new([40, 30, 20]);
+        let all = [Shows::Volume, Shows::Isosurface, Shows::Both, Shows::Xray, Shows::Section];
+        for shows in all {
+            let full = Variant { shaded: true, warp: true, exact: true, labels: true, ..Variant::of(shows) }.source(&layout, 2);
+            for absent in ["fan", "acoustic", "scatterer", "GAS_HU", "greys", "echoes", "hash"] {
+                assert!(!full.contains(absent), "{absent} in {shows:?}");
+            }
+        }
+        let stages = [Stage::Gather, Stage::Walk, Stage::Echo, Stage::Pulse, Stage::Beam, Stage::Scan];
+        let sources = stages.map(|s| code(&Variant { speckle: true, ..Variant::of(Shows::Ultrasound(s)) }.source(&layout, 2)));
+        for (stage, own) in stages.into_iter().zip(["acoustic(", "log2_less(", "scatterer(", "blurred[", "per_octave *", "colors["]) {
+            for (other, source) in stages.iter().zip(&sources) {
+                let shared = own == "blurred[" && *other == Stage::Beam;
+                assert!(shared || source.contains(own) == (stage == *other), "{own} of {stage:?} in {other:?}");
+            }
+        }
+        for (source, voxels) in sources.iter().zip([true, false, true, false, false, false]) {
+            assert_eq!(source.contains("slots"), voxels);
+            assert!(!source.contains("lattice") && !source.contains("Ray"));
+        }
+        let silent = Variant::of(Shows::Ultrasound(Stage::Echo)).source(&layout, 1);
+        assert!(!silent.contains("hash"), "nobody asked for scatterers");
     }
 
     /// Without comments and the frame's one set of numbers.

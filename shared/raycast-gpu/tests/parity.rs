@@ -1,4 +1,5 @@
-//! The contract of the twins: in every view at most one pixel in a thousand differs by more than 2/255 from the CPU's.
+//! The contract of the twins: in every view at most one pixel in a thousand differs by more than 2/255 from the CPU's, and of voxels that lie
+//! in a store nothing is uploaded, whatever is drawn. (The CPU has the same volume on the heap.)
 //!
 //! Why not none: f32 sums in another order, and `exp2` of another library, put a sample that lies on the edge of a table's entry or of
 //! a surface on the other side of it. The reference is the scalar kernel; where it refuses (warp, labels) the portable packets, whose
@@ -6,12 +7,12 @@
 
 mod common;
 
-use common::{body, difference, gpu, info, sliding, warp};
+use common::{World, body, difference, gpu, info, sliding, warp};
 use maille_raycast::{
-    Camera, Capsule, Extras, Geometry, Kernel, Labels, Light, Mode, Overlay, Picture, Plane, Preset, Section, Settings, Shading, Skip,
-    SlabMode, Step, Transfer, Warp, render_extra, section_with,
+    Camera, Capsule, Extras, Geometry, Kernel, Labels, Light, Mode, Overlay, Picture, Plane, Preset, Probe, Section, Settings, Shading,
+    Skip, SlabMode, Step, Transfer, Ultrasound, Warp, render_extra, section_with, ultrasound,
 };
-use maille_raycast_gpu::Renderer;
+use maille_raycast_gpu::{GpuError, Placement, Renderer, Traffic};
 use maille_volume::{BrickSource, BrickedVolume};
 
 /// Pixels that may differ.
@@ -20,21 +21,42 @@ const SIZE: [usize; 2] = [120, 90];
 
 struct Bench {
     source: BrickedVolume,
+    // what reads it goes first
     renderer: Renderer,
+    world: World,
+    /// all that was moved until the last picture
+    moved: Traffic,
     failures: Vec<String>,
 }
 
 impl Bench {
     fn new(size: [usize; 3], spacing: [f64; 3]) -> Option<Self> {
+        let gpu = gpu()?;
         let source = body(size, spacing);
-        let renderer = Renderer::for_volume(gpu()?, source.layout()).unwrap();
-        Some(Self { source, renderer, failures: Vec::new() })
+        let world = World::new(&source.to_volume());
+        let renderer = Renderer::for_store(gpu, &world.reader, Placement::InPlace).unwrap();
+        if let Some(notice) = renderer.notice() {
+            assert!(!renderer.gpu().is_software(), "{notice}");
+            eprintln!("SKIPPED: nothing is in place here: {notice}");
+        }
+        Some(Self { source, renderer, world, moved: Traffic::default(), failures: Vec::new() })
     }
 
     fn judge(&mut self, name: &str, cpu: &Picture, gpu: &Picture, dark: bool) {
         let (share, worst) = difference(cpu, gpu);
         let shown = cpu.rgb.iter().filter(|&&v| v > 20).count();
-        println!("{name}: {:.3} % of pixels differ by more than 2, at most {worst}; {shown} bytes above 20", share * 100.0);
+        let (now, before) = (self.renderer.traffic(), std::mem::replace(&mut self.moved, self.renderer.traffic()));
+        println!(
+            "{name}: {:.0} of {} pixels differ by more than 2 ({:.3} %), at most {worst}; {shown} bytes above 20; {} bytes of voxels uploaded, {} of all else",
+            share * (cpu.rgb.len() / 3) as f64,
+            cpu.rgb.len() / 3,
+            share * 100.0,
+            now.uploaded - before.uploaded,
+            now.other - before.other
+        );
+        if self.renderer.placement() == Placement::InPlace && (now.uploaded, now.fetched) != (0, 0) {
+            self.failures.push(format!("{name}: {now:?} in place"));
+        }
         if share > SHARE || (shown == 0) != dark {
             self.failures.push(format!("{name}: {share} of pixels, at most {worst}; {shown} bytes shown"));
         }
@@ -46,7 +68,10 @@ impl Bench {
         let mut cpu = Picture::with_depth(SIZE[0], SIZE[1]);
         render_extra(&Extras { kernel, ..*extras }, &self.source, &skip, camera, settings, &mut cpu).unwrap();
         let mut gpu = Picture::with_depth(SIZE[0], SIZE[1]);
-        self.renderer.render(extras, &self.source, &skip, camera, settings, &mut gpu).unwrap();
+        let snapshot = self.world.reader.snapshot();
+        let skip = Skip::new(&snapshot, settings);
+        self.renderer.render(extras, &snapshot, &skip, camera, settings, &mut gpu).unwrap();
+        drop(snapshot);
         self.judge(name, &cpu, &gpu, dark);
         // depths: the same where both see something, but for those samples on an edge
         let depths = cpu.depth.as_ref().unwrap().iter().zip(gpu.depth.as_ref().unwrap());
@@ -60,8 +85,26 @@ impl Bench {
         let mut cpu = Picture::new(SIZE[0], SIZE[1]);
         section_with(&self.source, section, overlay, &mut cpu);
         let mut gpu = Picture::new(SIZE[0], SIZE[1]);
-        self.renderer.section_with(&self.source, section, overlay, &mut gpu).unwrap();
+        self.renderer.section_with(&self.world.reader.snapshot(), section, overlay, &mut gpu).unwrap();
         self.judge(name, &cpu, &gpu, false);
+    }
+
+    fn echoes(&mut self, name: &str, settings: &Ultrasound, warp: Option<&Warp>, size: [usize; 2], dark: bool) {
+        let (mut cpu, mut gpu) = (Picture::with_depth(size[0], size[1]), Picture::with_depth(size[0], size[1]));
+        ultrasound(&self.source, settings, warp, &mut cpu).unwrap();
+        self.renderer.ultrasound(&self.world.reader.snapshot(), settings, warp, &mut gpu).unwrap();
+        self.judge(name, &cpu, &gpu, dark);
+        if cpu.depth != gpu.depth {
+            self.failures.push(format!("{name}: depths differ"));
+        }
+    }
+
+    /// A probe that looks at the middle of the body from somewhere on the way there, 0 far outside and 1 in the middle.
+    fn probe(&self, from: [f64; 3], share: f64) -> Ultrasound {
+        let c = self.source.info().grid.center();
+        let face = std::array::from_fn(|n| c[n] + (1.0 - share) * from[n]);
+        let probe = Probe::convex(face, from.map(|v| -v), [0.3, 1.0, -0.2]);
+        Ultrasound::new(Probe { depth_mm: 45.0, radius_mm: 40.0, ..probe })
     }
 
     fn outside(&self) -> Camera {
@@ -153,6 +196,47 @@ fn views_through_a_warp_are_those_of_the_cpu() {
     bench.end();
 }
 
+/// On the curved skin, with some millimetres of gel.
+const ON_SKIN: [f64; 3] = [12.0, -17.0, 8.0];
+
+#[test]
+fn ultrasound_is_that_of_the_cpu() {
+    let Some(mut bench) = Bench::new([52, 45, 49], [1.0, 1.1, 0.9]) else { return };
+    let skin = bench.probe(ON_SKIN, 0.0);
+    bench.echoes("ultrasound: bone and gas under curved skin", &skin, None, SIZE, false);
+    bench.echoes("ultrasound of interfaces alone", &Ultrasound { speckle: false, ..skin }, None, SIZE, false);
+    bench.echoes("ultrasound: from within tissue", &bench.probe([-3.0, 14.0, 9.0], 0.3), None, SIZE, false);
+    bench.echoes("ultrasound: on bone", &bench.probe(ON_SKIN, 0.45), None, SIZE, false);
+    bench.echoes("ultrasound: in gas", &bench.probe(ON_SKIN, 1.0), None, SIZE, false);
+    // of air there is the line where the probe ends
+    bench.echoes("ultrasound: in the air", &bench.probe([90.0, 20.0, -40.0], 0.0), None, SIZE, false);
+    bench.echoes("ultrasound: far away", &bench.probe([1e6, 1e8, -1e12], 0.0), None, SIZE, false);
+    let fine = Ultrasound { lines: 777, step_mm: 0.07, pulse_mm: 0.4, beam: [0.9, 0.03], gain: [40.0, 1.1], range_db: 45.0, ..skin };
+    bench.echoes("ultrasound: many fine samples", &fine, None, [301, 203], false);
+    let coarse = Ultrasound { lines: 2, step_mm: 1.3, ..skin };
+    bench.echoes("ultrasound: two coarse lines", &coarse, None, SIZE, false);
+    let flat = Probe { radius_mm: 1e5, angle_deg: 0.02, ..skin.probe };
+    bench.echoes("ultrasound: a flat face", &Ultrasound { probe: flat, ..skin }, None, SIZE, false);
+    let wide = Probe { radius_mm: 4.0, angle_deg: 175.0, depth_mm: 30.0, ..skin.probe };
+    bench.echoes("ultrasound: a wide fan", &Ultrasound { probe: wide, ..skin }, None, [331, 97], false);
+    let once = Probe { depth_mm: 0.3, ..bench.probe([-3.0, 14.0, 9.0], 0.3).probe };
+    bench.echoes("ultrasound: one sample a line", &Ultrasound { probe: once, ..skin }, None, SIZE, true);
+    bench.end();
+}
+
+#[test]
+fn ultrasound_through_a_warp_is_that_of_the_cpu() {
+    let Some(mut bench) = Bench::new([52, 45, 49], [1.0, 1.1, 0.9]) else { return };
+    let (moved, steep): (Warp, Warp) = (warp(&info(&bench.source)), sliding(&info(&bench.source)));
+    let (skin, inner) = (bench.probe(ON_SKIN, 0.0), bench.probe([-3.0, 14.0, 9.0], 0.3));
+    bench.echoes("warped ultrasound", &skin, Some(&moved), SIZE, false);
+    bench.echoes("warped ultrasound from within tissue", &inner, Some(&moved), SIZE, false);
+    bench.echoes("warped ultrasound of interfaces alone", &Ultrasound { speckle: false, ..skin }, Some(&moved), SIZE, false);
+    bench.echoes("sliding ultrasound, one by one", &skin, Some(&steep), SIZE, false);
+    bench.echoes("warped ultrasound in the air", &bench.probe([90.0, 20.0, -40.0], 0.0), Some(&moved), SIZE, false);
+    bench.end();
+}
+
 #[test]
 fn flat_and_thick_voxels_are_drawn_alike() {
     let Some(mut bench) = Bench::new([60, 55, 13], [0.8, 0.8, 4.0]) else { return };
@@ -163,6 +247,9 @@ fn flat_and_thick_voxels_are_drawn_alike() {
     bench.ray("spacing 1:5", &out, &tissue(), &none, false);
     bench.ray("spacing 1:5 from within", &inner, &Settings::isosurface(100.0), &none, false);
     bench.ray("spacing 1:5, warped", &out, &tissue(), &warped, false);
+    let probe = bench.probe([-11.0, -16.0, 9.0], 0.0);
+    bench.echoes("ultrasound, spacing 1:5", &probe, None, SIZE, false);
+    bench.echoes("ultrasound, spacing 1:5, warped", &probe, Some(&moved), SIZE, false);
     bench.end();
 }
 
@@ -195,8 +282,9 @@ fn sections_are_those_of_the_cpu() {
 
 #[test]
 fn pieces_of_ray_by_weight_are_drawn_alike_but_for_the_last_bit_of_a_weight() {
-    let Some(bench) = Bench::new([52, 45, 49], [1.0, 1.1, 0.9]) else { return };
-    let Bench { source, mut renderer, .. } = bench;
+    let Some(gpu) = gpu() else { return };
+    let source = body([52, 45, 49], [1.0, 1.1, 0.9]);
+    let mut renderer = Renderer::for_volume(gpu, source.layout()).unwrap();
     let c = source.info().grid.center();
     let camera = Camera { eye: [c[0] + 95.3, c[1] - 81.7, c[2] + 55.1], target: c, up: [0.0, 0.0, 1.0], fov_deg: 21.0 };
     let settings = Settings::volume(Preset::Ct.transfer());
@@ -234,4 +322,23 @@ fn what_the_cpu_refuses_is_refused_in_its_words() {
     let refused =
         bench.renderer.render(&Extras::default(), &bench.source, &skip, &Camera::around(bench.source.info()), &stale, &mut picture);
     assert!(refused.is_err());
+    let fan = bench.probe(ON_SKIN, 0.0);
+    let sideways = Ultrasound { probe: Probe { across: fan.probe.direction, ..fan.probe }, ..fan };
+    let alien = warp(&info(&body([24, 20, 20], [1.0; 3])));
+    for (bad, warp) in [(sideways, None), (Ultrasound { lines: 1, ..fan }, None), (fan, Some(&alien))] {
+        let untouched = picture.clone();
+        let by_gpu = bench.renderer.ultrasound(&bench.source, &bad, warp, &mut picture).unwrap_err();
+        let by_cpu = ultrasound(&bench.source, &bad, warp, &mut picture).unwrap_err();
+        assert!(matches!(by_gpu, GpuError::Render(_)), "{by_gpu:?}");
+        assert_eq!((by_gpu.to_string(), &picture), (by_cpu, &untouched));
+    }
+    // what the CPU could draw, though nobody would wait for it
+    let vast = Ultrasound { lines: 4096, step_mm: 45.0 / 16000.0, ..fan };
+    let refused = bench.renderer.ultrasound(&bench.source, &vast, None, &mut picture);
+    assert!(matches!(refused, Err(GpuError::Unsupported(_))), "{refused:?}");
+    bench.echoes("ultrasound after refusals", &fan, None, [1, 1], true);
+    let narrow = Ultrasound { probe: Probe { angle_deg: 0.5, ..fan.probe }, ..fan };
+    bench.echoes("ultrasound in a picture of a column", &narrow, None, [1, 97], false);
+    assert!(bench.renderer.ultrasound(&bench.source, &fan, None, &mut Picture::new(0, 7)).is_ok(), "as the CPU has it");
+    bench.end();
 }

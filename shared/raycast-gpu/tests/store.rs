@@ -3,63 +3,18 @@
 
 mod common;
 
-use common::{body, difference, gpu, gpu_of};
-use maille_contract::{Role, control::PIN_IDLE};
-use maille_raycast::{Camera, Extras, Picture, Preset, Settings, Skip, render};
+use common::{World, body, difference, gpu, gpu_of};
+use maille_raycast::{Camera, Extras, Picture, Preset, Probe, Settings, Skip, Ultrasound, render, ultrasound};
 use maille_raycast_gpu::{Choice, Gpu, GpuError, Placement, Renderer};
-use maille_store::{Reader, StoreKeeper, StoreSizes, Writer};
-use maille_transport::{ControlMap, Domain};
-use maille_volume::{BrickLayout, BrickSource, brick::Brick};
-use std::sync::{Arc, atomic::Ordering::Relaxed};
+use maille_volume::{BrickLayout, BrickSource, Volume, brick::Brick};
+use std::sync::Arc;
 
 const SIZE: [usize; 2] = [72, 60];
 const BRICK: u64 = size_of::<Brick>() as u64;
 
-struct World {
-    domain: Domain,
-    _control: ControlMap,
-    _keeper: StoreKeeper,
-    writer: Writer,
-    reader: Arc<Reader>,
-}
-
-impl World {
-    fn new() -> Self {
-        let volume = body([70, 52, 49], [1.0; 3]).to_volume();
-        let domain = Domain::fresh().unwrap();
-        let control = ControlMap::create(&domain).unwrap();
-        let sizes = StoreSizes { spare_slots: 12, ..StoreSizes::default() };
-        let keeper = StoreKeeper::create(&domain, &volume, sizes, |_| {}).unwrap();
-        let writer = Writer::open(&domain).unwrap();
-        let reader = Arc::new(Reader::open(&domain, Role::Rendering).unwrap());
-        Self { domain, _control: control, _keeper: keeper, writer, reader }
-    }
-
-    /// Fills bricks with bone and publishes them.
-    fn change(&mut self, bricks: &[u32]) {
-        let mut transaction = self.writer.begin();
-        for &id in bricks {
-            let brick = transaction.brick_mut(id);
-            brick.voxels.fill(800);
-            brick.summarise();
-        }
-        transaction.commit();
-    }
-
-    fn count(&self) -> u64 {
-        self.reader.rest().layout().count() as u64
-    }
-
-    /// Whether the renderer's role holds no epoch.
-    fn free(&self) -> bool {
-        self.reader.control().pins[Role::Rendering.pins()].iter().all(|pin| pin.word.load(Relaxed) == PIN_IDLE)
-    }
-}
-
-impl Drop for World {
-    fn drop(&mut self) {
-        self.domain.remove().unwrap();
-    }
+/// What lies in the store.
+fn volume() -> Volume {
+    body([70, 52, 49], [1.0; 3]).to_volume()
 }
 
 fn settings() -> Settings {
@@ -83,7 +38,7 @@ fn both(world: &World, renderer: &mut Renderer) -> Picture {
 #[test]
 fn in_place_nothing_is_uploaded_and_commits_are_seen() {
     let Some(gpu) = gpu() else { return };
-    let mut world = World::new();
+    let mut world = World::new(&volume());
     let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::InPlace).unwrap();
     if let Some(notice) = renderer.notice() {
         assert!(!renderer.gpu().is_software(), "{notice}");
@@ -105,10 +60,57 @@ fn in_place_nothing_is_uploaded_and_commits_are_seen() {
     assert!(world.free());
 }
 
+/// A probe on the skin.
+fn probe(source: &impl BrickSource) -> Ultrasound {
+    let centre = source.info().grid.center();
+    let face = std::array::from_fn(|c| centre[c] - [14.0, 15.0, -10.0][c]);
+    Ultrasound::new(Probe { depth_mm: 50.0, ..Probe::convex(face, [14.0, 15.0, -10.0], [1.0, -1.0, 0.3]) })
+}
+
+#[test]
+fn an_ultrasound_fan_reads_voxels_in_place_and_sees_commits() {
+    let Some(gpu) = gpu() else { return };
+    let mut world = World::new(&volume());
+    let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::Auto).unwrap();
+    let in_place = renderer.placement() == Placement::InPlace;
+    let mut draw = |world: &World| {
+        let snapshot = world.reader.snapshot();
+        let (mut cpu, mut gpu) = (Picture::new(SIZE[0], SIZE[1]), Picture::new(SIZE[0], SIZE[1]));
+        ultrasound(&snapshot, &probe(&snapshot), None, &mut cpu).unwrap();
+        let report = renderer.ultrasound(&snapshot, &probe(&snapshot), None, &mut gpu).unwrap();
+        let (share, worst) = difference(&cpu, &gpu);
+        assert!(share <= 0.001, "{share} of pixels, at most {worst}");
+        (gpu, report)
+    };
+    let (before, first) = draw(&world);
+    let (same, second) = draw(&world);
+    assert!(first.built && !second.built && same == before);
+    assert_eq!((second.traffic.changed, second.traffic.uploaded, second.traffic.other), (0, 0, 0), "nothing changed and nothing is sent");
+    world.change(&[20, 21, 26]);
+    let (after, third) = draw(&world);
+    assert!(difference(&before, &after).0 > 0.01, "the commit is not to be seen");
+    assert_eq!(third.traffic.changed, 3);
+    if in_place {
+        assert_eq!([first, second, third].map(|r| (r.traffic.uploaded, r.traffic.fetched)), [(0, 0); 3]);
+    }
+    assert!(world.free());
+    // its buffers come back when they are asked for again
+    renderer.forget_ultrasound();
+    let snapshot = world.reader.snapshot();
+    let mut again = Picture::new(SIZE[0], SIZE[1]);
+    renderer.ultrasound(&snapshot, &probe(&snapshot), None, &mut again).unwrap();
+    assert_eq!(again, after);
+    renderer.gpu().give_up();
+    let untouched = again.clone();
+    let lost = renderer.ultrasound(&snapshot, &probe(&snapshot), None, &mut again);
+    assert!(matches!(lost, Err(GpuError::Lost(_))), "{lost:?}");
+    assert_eq!(again, untouched);
+}
+
 #[test]
 fn resident_bricks_are_fetched_by_the_device_and_only_changed_ones() {
     let Some(gpu) = gpu() else { return };
-    let mut world = World::new();
+    let mut world = World::new(&volume());
     let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::Resident).unwrap();
     if renderer.placement() != Placement::Resident {
         eprintln!("SKIPPED: {}", renderer.notice().unwrap_or_default());
@@ -127,7 +129,7 @@ fn resident_bricks_are_fetched_by_the_device_and_only_changed_ones() {
 #[test]
 fn without_the_extension_changed_bricks_are_uploaded_and_it_is_said() {
     let Some(gpu) = gpu_of(&Choice { without_import: true, ..Choice::any() }) else { return };
-    let mut world = World::new();
+    let mut world = World::new(&volume());
     assert!(!gpu.can_import());
     let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::Auto).unwrap();
     assert!(renderer.notice().unwrap().contains("uploaded"));
@@ -142,7 +144,7 @@ fn without_the_extension_changed_bricks_are_uploaded_and_it_is_said() {
 fn voxels_in_many_small_buffers_are_the_same_voxels() {
     for placement in [Placement::InPlace, Placement::Resident, Placement::Uploaded] {
         let Some(gpu) = gpu_of(&Choice { buffer_bytes: Some(64 * BRICK), ..Choice::any() }) else { return };
-        let mut world = World::new();
+        let mut world = World::new(&volume());
         assert!(world.count() > 64, "more than one buffer");
         let mut renderer = Renderer::for_store(gpu, &world.reader, placement).unwrap();
         both(&world, &mut renderer);
@@ -154,7 +156,7 @@ fn voxels_in_many_small_buffers_are_the_same_voxels() {
 #[test]
 fn an_epoch_is_pinned_until_the_device_has_answered() {
     let Some(gpu) = gpu() else { return };
-    let mut world = World::new();
+    let mut world = World::new(&volume());
     let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::InPlace).unwrap();
     let before = both(&world, &mut renderer);
     assert!(world.free());
@@ -180,7 +182,7 @@ fn an_epoch_is_pinned_until_the_device_has_answered() {
 #[test]
 fn a_mapping_lives_as_long_as_the_renderer_that_reads_it() {
     let Some(gpu) = gpu() else { return };
-    let world = World::new();
+    let world = World::new(&volume());
     let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::InPlace).unwrap();
     both(&world, &mut renderer);
     let alone = Arc::strong_count(&world.reader);
@@ -194,7 +196,7 @@ fn without_a_device_there_is_an_error_and_the_cpu_has_the_frame() {
     let missing = Gpu::open(&Choice { name: Some("a device that nobody makes".into()), ..Choice::any() });
     assert!(matches!(missing, Err(GpuError::NoAdapter(_))));
     let Some(gpu) = gpu() else { return };
-    let world = World::new();
+    let world = World::new(&volume());
     let mut renderer = Renderer::for_store(gpu, &world.reader, Placement::Auto).unwrap();
     both(&world, &mut renderer);
     renderer.gpu().give_up();

@@ -51,6 +51,9 @@ pub enum RenderError {
     /// a warp or labels made for another volume, or a warp that was never updated
     #[error("{0}")]
     Extras(String),
+    /// an ultrasound fan that makes no sense (see [`Ultrasound::fault`](crate::Ultrasound::fault)), or whose warp is another volume's
+    #[error("{0}")]
+    Ultrasound(String),
 }
 
 /// Which code walks the rays.

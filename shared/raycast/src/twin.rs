@@ -4,14 +4,16 @@
 //! gives plain numbers; maps are borrowed where they lie. Not a second interface for those who want pictures.
 
 use crate::{
-    Camera, Extras, Geometry, Labels, Picture, Plane, RenderError, Section, Settings, Skip, Warp,
+    Camera, Extras, Geometry, Labels, Picture, Plane, RenderError, Section, Settings, Skip, Ultrasound, Warp,
     frame::Frame,
     raster::Solids,
     render::{check, check_extras},
     settings::Adaptive,
+    ultrasound,
 };
 use maille_volume::BrickSource;
 
+pub use crate::ultrasound::{MOST_LINES, Plan as Fan, Scan};
 pub use crate::warp::Exact;
 pub use crate::{frame::REFINEMENTS, frame::TINY, scalar::ZERO_GRADIENT, skip::GENTLE, walk::LAST_PIECE};
 
@@ -159,3 +161,23 @@ pub fn section_axes(plane: Plane) -> [[f64; 3]; 3] {
     let [right, down] = plane.axes();
     [right, down, crate::geometry::cross(right, down)]
 }
+
+/// Numbers of a fan and of its picture, after the same checks as [`ultrasound`](crate::ultrasound())'s.
+///
+/// # Errors
+/// [`RenderError::Ultrasound`], in its words.
+pub fn fan<S: BrickSource + ?Sized>(
+    source: &S,
+    settings: &Ultrasound,
+    warp: Option<&Warp>,
+    size: [usize; 2],
+) -> Result<(Fan, Scan), RenderError> {
+    let plan = ultrasound::planned(source, settings, warp).map_err(RenderError::Ultrasound)?;
+    let scan = Scan::new(settings, &plan, size);
+    Ok((plan, scan))
+}
+
+/// What decides along a line: values of air and below which there is gas (HU), interfaces too faint for a direction, the least that one lets through, the
+/// least echo.
+pub const ECHO: (f64, f64, f64, f64, f32) =
+    (ultrasound::AIR_HU, ultrasound::GAS_HU, ultrasound::FAINT, ultrasound::LEAST_PASS, ultrasound::LEAST_ECHO);

@@ -219,7 +219,7 @@ pub enum Backend {
     /// the ray caster on the CPU
     #[default]
     Cpu,
-    /// its twin on a GPU, by Vulkan; ultrasound, and whatever it cannot draw, falls to the CPU
+    /// its twin on a GPU, by Vulkan; whatever it cannot draw falls to the CPU
     Gpu,
 }
 

@@ -1,9 +1,13 @@
 //! What tests of the twin share: a device or a loud sentence, volumes with something in them, a field.
 #![allow(dead_code)] // each test file uses its part
 
+use maille_contract::{Role, control::PIN_IDLE};
 use maille_raycast::{Motion, Picture, Warp, WarpOptions};
 use maille_raycast_gpu::{Choice, Gpu};
+use maille_store::{Reader, StoreKeeper, StoreSizes, Writer};
+use maille_transport::{ControlMap, Domain};
 use maille_volume::{BrickSource, BrickedVolume, Grid, Rescale, VectorField, Volume, VolumeInfo};
+use std::sync::{Arc, atomic::Ordering::Relaxed};
 
 /// Any device, software too; without one a sentence, or under CI a failure.
 pub fn gpu() -> Option<Gpu> {
@@ -99,6 +103,53 @@ pub fn sliding(info: &VolumeInfo) -> Warp {
     let report = warp.update(info, &motion, &[1.0]).expect("one coefficient for one field");
     assert!(report.rough > 0, "{report:?}");
     warp
+}
+
+/// A patient in a store of its own.
+pub struct World {
+    domain: Domain,
+    _control: ControlMap,
+    _keeper: StoreKeeper,
+    pub writer: Writer,
+    pub reader: Arc<Reader>,
+}
+
+impl World {
+    pub fn new(volume: &Volume) -> Self {
+        let domain = Domain::fresh().unwrap();
+        let control = ControlMap::create(&domain).unwrap();
+        let sizes = StoreSizes { spare_slots: 12, ..StoreSizes::default() };
+        let keeper = StoreKeeper::create(&domain, volume, sizes, |_| {}).unwrap();
+        let writer = Writer::open(&domain).unwrap();
+        let reader = Arc::new(Reader::open(&domain, Role::Rendering).unwrap());
+        Self { domain, _control: control, _keeper: keeper, writer, reader }
+    }
+
+    /// Fills bricks with bone and publishes them.
+    pub fn change(&mut self, bricks: &[u32]) {
+        let mut transaction = self.writer.begin();
+        for &id in bricks {
+            let brick = transaction.brick_mut(id);
+            brick.voxels.fill(800);
+            brick.summarise();
+        }
+        transaction.commit();
+    }
+
+    pub fn count(&self) -> u64 {
+        self.reader.rest().layout().count() as u64
+    }
+
+    /// Whether the renderer's role holds no epoch.
+    pub fn free(&self) -> bool {
+        self.reader.control().pins[Role::Rendering.pins()].iter().all(|pin| pin.word.load(Relaxed) == PIN_IDLE)
+    }
+}
+
+impl Drop for World {
+    fn drop(&mut self) {
+        self.domain.remove().unwrap();
+    }
 }
 
 /// Share of pixels whose colours differ by more than 2/255, and the largest difference.
