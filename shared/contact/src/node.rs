@@ -6,7 +6,7 @@
 //! the rate of commits. So tissue resists by how far it was pushed from where the ball first met it. Withdrawn, the ball leaves a dent: with
 //! a gap g between ball and tissue, m fades by exp(−Δg / 1.5 mm) while g grows, so the force ends near the dent that is seen
 //! (a dent that springs back in further commits instead lowers m and raises d, and is felt as elastic). Sliding along the
-//! surface by t lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. A gap above 0.3 mm, which no push leaves, lets m fall by itself: tissue
+//! surface by t (the ball's own way: its foot may leap) lets m fade by exp(−t/(2r)): elsewhere nothing was pushed yet. A gap above 0.3 mm, which no push leaves, lets m fall by itself: tissue
 //! that went away (exhaling) is let go within some 0.1 s. At δ = 0 the contact ends and m is forgotten. What is no
 //! pushing is carried in a second term β that goes to 0 within 0.1 s, δ = max(0, d + m + β): a
 //! surface that comes towards the ball (relaxing or breathing tissue) beyond where it was met, a new threshold, a foot that
@@ -46,7 +46,10 @@ const MATERIAL_DEPTH_MM: f64 = 1.5;
 /// Largest component of a force that is believed [N]: a hundred times what devices give.
 const MAX_NODE_N: f64 = 1e3;
 /// Turn of the normal in a tick that is felt as it is [rad].
-const MAX_TURN: f64 = 0.03;
+const MAX_TURN: f64 = 0.02;
+/// What the depth may change in a tick without the ball going there [mm], and as a part of the ball's way: beyond it the foot has leapt.
+const LEAP_MM: f64 = 0.02;
+const LEAP_SHARE: f64 = 0.2;
 /// Largest give-way that is believed [mm].
 const MAX_GIVE_WAY_MM: f64 = 60.0;
 
@@ -216,7 +219,12 @@ impl Node {
         let bias = self.bias;
         if self.last_point.is_some() {
             let change = before.filter(|_| blend.is_some()).map(|before| before - d);
-            self.carry(change, now, d, point);
+            // the foot slid further in this tick than the ball's motion explains
+            let leap = before.filter(|_| blend.is_none()).map_or(0.0, |before| before - d);
+            if leap.abs() > LEAP_MM + LEAP_SHARE * came.norm() {
+                self.leapt += leap;
+            }
+            self.carry(change, now, d, (came - normal * came.dot(&normal)).norm());
         } else if moved || now.committed || now.other_surface || before.is_none() {
             // already pressed where it is found first (or again, after a tick without a foot), or met by tissue that came: felt gradually, but for what
             // the hand's own motion did
@@ -248,9 +256,8 @@ impl Node {
 
     /// Carries m and β over a tick. A surface that moved changed d by −`change`: that goes to m when a commit did it (β takes what
     /// would make m negative) and to β when not. Sliding, a growing gap and time let them fade.
-    fn carry(&mut self, change: Option<f64>, now: &Circumstances<'_>, d: f64, point: V3) {
+    fn carry(&mut self, change: Option<f64>, now: &Circumstances<'_>, d: f64, slid: f64) {
         let dt = now.dt;
-        let travelled = self.last_point.map_or(V3::zeros(), |last| point - last);
         match change {
             Some(change) if now.committed && !now.other_surface => {
                 self.give_way += change;
@@ -259,7 +266,7 @@ impl Node {
             }
             Some(change) if now.other_surface => self.bias += change,
             Some(change) => self.leapt += change,
-            None => self.give_way *= (-travelled.norm() / (2.0 * self.proxy.radius_mm())).exp(),
+            None => self.give_way *= (-slid / (2.0 * self.proxy.radius_mm())).exp(),
         }
         let gap = (-d).max(0.0);
         if change.is_some() || gap == 0.0 {
