@@ -365,6 +365,8 @@ impl NeedleStage {
                 (log.path_nodes, log.path_mm) = (log.last_nodes, log.last_mm);
             }
         }
+        // gone through while nobody looked: touched all the same
+        log.touched |= u64::from(out.found & !1);
         for event in out.events.iter().flatten() {
             log.take(NeedleEvent {
                 time_ns: moment.now_ns,

@@ -5,7 +5,7 @@
 mod common;
 
 use common::{DT, Random, config, half_space, straight, tick, with};
-use maille_needle::{AtRest, Gauge, HandlePose, Material, NeedleConfig, NeedleTool, Outputs, Q, RodParameters, V3};
+use maille_needle::{AtRest, Gauge, HandlePose, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q, RodParameters, V3};
 
 /// With the limits that a desktop device has: 3.3 N and 150 N·mm.
 fn tool() -> NeedleTool {
@@ -201,4 +201,36 @@ fn a_hand_gets_no_more_out_than_it_put_in() {
         assert!(led.end > 10.0, "cutting and friction take energy: {} N·mm", led.end);
     }
     println!("work of the hand less stored energy: at least {least:.3} N·mm");
+}
+
+#[test]
+fn a_pre_bent_needle_that_is_led_round_and_rolled_gives_nothing_out_either_way_round() {
+    // 18 gauge, 150 mm, bent over the last 60 mm, 60 mm deep: rolled by ±90° and moved by ±8 mm, a quarter of a period apart
+    let gauge = Gauge::of(18).unwrap();
+    for (radius, axis, friction) in [(120.0, 0, 0.025), (120.0, 1, 0.025), (300.0, 1, 1e-9), (f64::INFINITY, 0, 1e-9)] {
+        for way in [1.0, -1.0] {
+            let config = NeedleConfig::new(RodParameters::new(&gauge, 150.0));
+            let table = MaterialTable::new(&[Material { friction_n: friction, ..Material::LIVER_TRAINING }]).unwrap();
+            let mut tool = NeedleTool::with_rest(config, table, |s| [0.0, if s >= 90.0 { 1.0 / radius } else { 0.0 }, 0.0]).unwrap();
+            let pose = |side: f64, depth: f64, roll: f64| {
+                let q = Q::from_scaled_axis(V3::z() * roll);
+                let at = V3::z() * (depth - 150.0) + V3::ith(axis, side);
+                HandlePose { position_mm: at.into(), orientation_xyzw: [q.i, q.j, q.k, q.w] }
+            };
+            for n in 0..6000 {
+                tick(&mut tool, pose(0.0, -1.0 + 61.0 * f64::from(n) / 5999.0, 0.0), &AtRest, &half_space);
+            }
+            let period = 4.0;
+            let led = lead(&mut tool, (3.0 * period / DT) as usize, (period / DT) as usize, |t| {
+                let (rise, phase) = ((t / period).min(1.0), std::f64::consts::TAU * t / period);
+                pose(8.0 * rise * phase.cos(), 60.0, std::f64::consts::FRAC_PI_2 * rise * (1.0 + way * phase.sin()))
+            });
+            let rounds: Vec<f64> = led.rounds.windows(2).map(|w| w[1] - w[0]).collect();
+            println!(
+                "radius {radius}, along {axis}, {way:+} round: {:.2?} of the limits, least {:.4}, by rounds {rounds:.4?} mJ",
+                led.reached, led.least
+            );
+            assert!(led.least > -0.05 && rounds.iter().all(|mj| *mj > -0.02), "{} {rounds:?}", led.least);
+        }
+    }
 }

@@ -27,7 +27,7 @@
 //! friction and the tip's spring balance, and the handle is where its base is. The rod's drag is then against the tissue at its tip, not against the world:
 //! else a breath would drag it behind.
 //!
-//! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre.
+//! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre. See `axial`.
 //!
 //! Units: mm, N, N·mm, s; frame: world, where not said otherwise. Degraded modes: a pose that is not finite or whose quaternion is none → the last
 //! one stands, counted; jumps are counted, and the path is laid anew; a path that is full stops the tip's nodes, not
@@ -77,8 +77,10 @@ pub struct NeedleTool {
     ahead_mm: f64,
     /// w_l at the last tick, while nobody holds the needle [mm]
     carried: Option<V3>,
-    /// share of the tip's memory that has relaxed, 0 … 1
+    /// share of friction's memory that has relaxed, 0 … 1
     relaxed: f64,
+    /// what has relaxed of the force at the tip [N]
+    relaxed_n: f64,
     /// σ of the friction springs, see `axial`
     softened: f64,
     /// ρ of their limits, see `axial`
@@ -127,6 +129,7 @@ impl NeedleTool {
             ahead_mm: 0.0,
             carried: None,
             relaxed: 0.0,
+            relaxed_n: 0.0,
             softened: 1.0,
             smoothed: 1.0,
             friction_n: 0.0,
@@ -177,9 +180,7 @@ impl NeedleTool {
             self.path.clear();
             self.leave();
         }
-        if self.path.nodes().is_empty() {
-            self.look_for_skin(inputs, anew, &mut told);
-        }
+        let found = if self.path.nodes().is_empty() { self.look_for_skin(inputs, anew, &mut told) } else { 0 };
         if let (Some(tip), true) = (left, self.path.nodes().is_empty()) {
             tell(&mut told, Event::withdrawn(&tip));
         }
@@ -187,6 +188,7 @@ impl NeedleTool {
         if !self.path.nodes().is_empty() {
             self.inside(inputs, held, dt, &mut told, &mut out);
         }
+        out.found = found;
         out.path_nodes = self.path.nodes().len();
         out.handle = HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() };
         out.events = told;
@@ -210,6 +212,7 @@ impl NeedleTool {
             ahead_mm: 0.0,
             path_nodes: 0,
             material: AIR,
+            found: 0,
             handle: HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() },
             solved: Solved { converged: true, ..Solved::default() },
             events: [None; crate::limits::MAX_EVENTS],
@@ -269,18 +272,18 @@ impl NeedleTool {
             };
             self.reference = inputs.breathing.to_reference(device.into(), (tip + direction * ahead).into()).into();
             ahead = (self.reference - tip).dot(&direction);
-            let went = self.path.follow(ahead, direction, self.fresh(), inputs.tissue, &self.table, told);
+            let went = self.path.follow(ahead, direction, self.relaxed_n, inputs.tissue, &self.table, told);
             if self.path.nodes().is_empty() {
                 self.leave();
                 *out = self.outside();
                 return;
             }
             ahead = (ahead - went).max(0.0);
-            self.relax(went.abs(), dt);
+            self.relax(went.abs(), ahead, dt);
             self.faults.path_full += u64::from(self.path.nodes().len() == self.path.capacity());
         } else {
-            self.relax(0.0, dt);
             ahead = self.settle(dt);
+            self.relax(0.0, ahead, dt);
         }
         self.ahead_mm = ahead;
         // proxies of the nodes that are there now
