@@ -234,3 +234,49 @@ fn a_pre_bent_needle_that_is_led_round_and_rolled_gives_nothing_out_either_way_r
         }
     }
 }
+
+/// Tissue that sways as a whole, across the needle and along it, over a second.
+struct Sway(f64);
+
+impl maille_needle::Breathing for Sway {
+    fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
+        let level = (std::f64::consts::TAU * self.0).sin();
+        // more the deeper it lies: it shears and stretches
+        let share = 0.5 + 0.005 * x[2].clamp(0.0, 100.0);
+        [8.0 * level * share, 3.0 * level, 0.15 * (2.0 * std::f64::consts::TAU * self.0).sin() * share]
+    }
+}
+
+#[test]
+fn work_of_hand_and_tissue_is_what_is_stored_while_nothing_slides_or_is_cut() {
+    let config = NeedleConfig { max_force_n: 100.0, max_torque_n_mm: 1e4, friction_slew_n_per_s: 1e6, ..config() };
+    // friction that holds: nothing slides
+    let mut tool = with(config, Material { friction_n: 10.0, cutting_force_n: 0.5, ..Material::LIVER_TRAINING });
+    for n in 0..3000 {
+        tick(&mut tool, straight(60.0 * f64::from(n) / 2999.0), &AtRest, &half_space);
+    }
+    // back, so that what lies before the tip is slack enough
+    for n in 0..200 {
+        tick(&mut tool, straight(60.0 - 0.001 * f64::from(n)), &AtRest, &half_space);
+    }
+    let first = tool.stored_n_mm();
+    let (mut hand, mut tissue, mut most, mut off) = (0.0, 0.0, 0.0f64, 0.0f64);
+    let mut before: Option<(HandlePose, Outputs)> = None;
+    for n in 0..2000 {
+        let t = f64::from(n) * DT;
+        // the hand moves too, in a time of its own
+        let pose = moved(59.8, [2.0 * (3.0 * t).sin(), 2.0 * (5.0 * t).sin()], [0.02 * (4.0 * t).sin(), 0.02 * (2.0 * t).sin()]);
+        let out = tick(&mut tool, pose, &Sway(t), &half_space);
+        if let Some((p, o)) = &before {
+            hand += work((p, o), (&pose, &out));
+        }
+        tissue += out.tissue_mj;
+        before = Some((pose, out));
+        let stored = tool.stored_n_mm() - first;
+        most = most.max(stored);
+        off = off.max((hand + tissue - stored).abs());
+    }
+    println!("stored up to {most:.2} mJ; hand {hand:.2} and tissue {tissue:.2} mJ in all; never off by more than {off:.3} mJ");
+    // what is off: the needle's own drag, and springs across the path that turn with it
+    assert!(tissue.abs() > 5.0 && most > 3.0 && off < 0.12 * most && off < 0.05 * tissue.abs(), "{off} of {most}");
+}

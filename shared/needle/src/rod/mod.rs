@@ -334,6 +334,11 @@ impl Rod {
         self.grip.stiffness_n_per_mm * (self.shape.nodes[0] - self.grip.position_mm)
     }
 
+    /// Force of the needle on what an attachment's spring pulls to [N]; attachments by arc length from the base.
+    pub fn force_on_target_n(&self, attachment: usize) -> Option<V3> {
+        self.attachments.get(attachment).map(|a| a.stiffness_n_per_mm * (self.point(a.arc_mm) - a.target_mm))
+    }
+
     /// Moment of the needle on its grip [N·mm].
     pub fn moment_on_grip_n_mm(&self) -> V3 {
         self.joints[0].moment

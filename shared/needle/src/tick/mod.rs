@@ -34,6 +34,7 @@
 //! the needle. Cost: 10–20 µs with 25 nodes. Allocation: none. Not here: slew limits and fading (`maille-contact`), where tissue comes from.
 
 mod axial;
+mod breath;
 mod drag;
 mod give;
 mod hold;
@@ -66,6 +67,9 @@ pub struct NeedleTool {
     position: V3,
     orientation: Q,
     hold: Hold,
+    moved: breath::Moved,
+    /// nodes of the path, from the skin on, that the needle does not reach
+    not_reached: usize,
     seen: bool,
     /// distance from handle to point of the unloaded needle, by node [mm]; none where it is straight
     chords: Vec<f64>,
@@ -123,6 +127,8 @@ impl NeedleTool {
             position: V3::zeros(),
             orientation: Q::identity(),
             hold: Hold::new(),
+            moved: breath::Moved::new(room),
+            not_reached: 0,
             seen: false,
             reference: V3::zeros(),
             inserted_mm: None,
@@ -213,6 +219,7 @@ impl NeedleTool {
             path_nodes: 0,
             material: AIR,
             found: 0,
+            tissue_mj: 0.0,
             handle: HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() },
             solved: Solved { converged: true, ..Solved::default() },
             events: [None; crate::limits::MAX_EVENTS],
@@ -254,7 +261,9 @@ impl NeedleTool {
     ) {
         let length = self.config.rod.length_mm;
         // arc lengths of the last tick, then those of this one: what tissue did along the needle
-        let skin = self.carry(inputs.breathing);
+        let stored = if held { 0.0 } else { self.stored_n_mm() };
+        let skin = self.breathe(inputs.breathing);
+        let before = self.work_of_breath();
         let axis = self.rod.tip_tangent();
         let inserted = if held { length - self.outside_mm(skin) } else { self.arc_of_tip() + self.ahead_mm };
         let forward = inserted - self.inserted_mm.unwrap_or(inserted);
@@ -298,6 +307,7 @@ impl NeedleTool {
         if !held {
             self.hang();
         }
+        out.tissue_mj = if held { 0.5 * (before + self.work_of_breath()) } else { (self.stored_n_mm() - stored).max(0.0) };
         self.give(held, cutting, friction, out);
         let tip = &self.path.nodes()[self.path.nodes().len() - 1];
         out.tip_reference_mm = tip.reference.into();
