@@ -104,8 +104,6 @@ pub(crate) struct NeedleStage {
     path_reference: Vec<V3>,
     /// what goes through the handle: energy of force and torque
     port: NeedlePort,
-    /// nobody breathes: the hand gets no energy that it did not put in
-    still: bool,
     /// in a scene in which tissue is dragged along
     drag: Option<Box<Dragged>>,
     /// what the tick's rod left [1e-12 mm]
@@ -198,8 +196,7 @@ impl NeedleStage {
             log,
             ticks: 0,
             path_reference: Vec::with_capacity(room),
-            port: NeedlePort::default(),
-            still: !scene.has_effect("breathing"),
+            port: NeedlePort::new(0.0),
             drag: scene.has_effect("needle-drag").then(|| Box::new(dragged())),
             residual: None,
             faults: [0; 5],
@@ -214,7 +211,7 @@ impl NeedleStage {
         if let Some((log, _)) = control.needle_log.load::<NeedleLog>() {
             self.log = log;
         }
-        self.port.balance_mj = self.log.port_mj[0];
+        self.port = NeedlePort::new(self.log.port_mj[0]);
     }
 
     /// One tick.
@@ -231,9 +228,13 @@ impl NeedleStage {
             self.force.leave(LEAVE_SLEW_N_PER_S);
             self.torque.leave(self.torque.limits().max_force_n / LEAVE_FADE_S);
         }
-        let force_n = self.force.shape(out.force_n, step, fading);
-        let torque_n_mm = self.torque.shape(out.torque_n_mm, step, fading);
-        let [force_n, torque_n_mm] = if self.still { self.port.lower(force_n, torque_n_mm) } else { [force_n, torque_n_mm] };
+        // what the breath put in is there to be had; then the limits of slew hold whatever is lowered
+        let tool = &self.tool;
+        self.port.grant(out.tissue_mj, || tool.stored_n_mm());
+        let slew = [&self.force, &self.torque].map(|shaper| shaper.limits().max_slew_n_per_s * step);
+        let [force_n, torque_n_mm] = self.port.lower(out.force_n, out.torque_n_mm, slew);
+        let force_n = self.force.shape(force_n, step, fading);
+        let torque_n_mm = self.torque.shape(torque_n_mm, step, fading);
         self.ticks += 1;
         self.drag(moment.now_ns, breathing);
         // where tissue gives way the needle is seen where the hand has it
@@ -337,7 +338,7 @@ impl NeedleStage {
         // a process that was restarted counts from nought
         (0..5).for_each(|n| log.faults[n] += now[n] - self.faults[n]);
         self.faults = now;
-        log.port_mj = [self.port.balance_mj, log.port_mj[1].min(self.port.balance_mj)];
+        log.port_mj = [self.port.hand_mj, log.port_mj[1].min(self.port.hand_mj)];
         // outside there is no distance to tell
         log.to_target_mm[0] = f64::NAN;
         if let (Some(target), true) = (self.target, out.path_nodes > 1) {
@@ -365,6 +366,8 @@ impl NeedleStage {
                 (log.path_nodes, log.path_mm) = (log.last_nodes, log.last_mm);
             }
         }
+        // gone through while nobody looked: touched all the same
+        log.touched |= u64::from(out.found & !1);
         for event in out.events.iter().flatten() {
             log.take(NeedleEvent {
                 time_ns: moment.now_ns,

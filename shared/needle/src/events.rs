@@ -26,7 +26,7 @@ pub struct Event {
     pub reference_mm: [f64; 3],
     /// path cut so far, in reference space [mm]
     pub depth_mm: f64,
-    /// force at the tip just before [N]: of a tissue that was cut its threshold (eq. 4), less what had relaxed
+    /// force at the tip just before [N]: of a tissue that was cut its threshold (eq. 4)
     pub force_n: f64,
 }
 

@@ -11,6 +11,7 @@
 #![forbid(unsafe_code)]
 #![cfg_attr(test, allow(clippy::disallowed_macros))] // tests say what they see
 
+mod borders;
 pub mod breathing;
 mod config;
 mod error;

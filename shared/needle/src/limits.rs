@@ -20,6 +20,8 @@ pub const MAX_SKIN_STEPS: usize = 48;
 pub const MAX_SKIN_HALVINGS: usize = 16;
 /// Looks ahead of a tip that moves in one tick, for layers in between.
 pub const MAX_LOOKS: usize = 64;
+/// Borders that a path remembers: as many tissues as a trocar may cross on its way, and back into some.
+pub const MAX_BORDERS: usize = 24;
 /// Longest time step that is believed [s].
 pub const MAX_STEP_S: f64 = 0.1;
 /// Part of what a device can hold along the needle that is the tip's; friction has what is left of the whole. Neither shall vanish: a tip is felt as it is

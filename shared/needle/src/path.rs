@@ -8,18 +8,21 @@
 //!
 //! where the last two leave exactly the deflection at which the spring holds f_cut. Nearer to p_{l−1} than 0.5·Δp that node goes; further than
 //! 1.5·Δp a node is placed Δp behind it. A tip that moves far in one tick looks at the tissue on its way, so that no layer is missed. A layer at
-//! the entry of a tissue ([`crate::Capsule`]) holds the tip at the border until its own force is reached. Where the next tissue is stiffer, its spring
+//! the entry of a tissue ([`crate::Capsule`]) holds the tip at the border until its own force is reached; what of it is cut stays cut (`borders`). f_cut is held
+//! against the force that the tip really has: a spring that has relaxed by f_r (`axial`) has to be stretched further, to Δd with
+//! a₂Δd² + a₁Δd = f_cut + f_r. Where the next tissue is stiffer, its spring
 //! begins at the force that the last one held ([`Path::preload_mm`]): a border does not store energy.
 //!
 //! Units: mm, N; frame: reference. Invariants: neighbours are never nearer than 0.5·Δp or further than 1.5·Δp, but for a first piece that is
 //! shorter; capacity is fixed. Cost: at most [`MAX_LOOKS`] look-ups a tick, one where the needle moves slowly. Allocation: none after `new`.
 
+use crate::borders::{Borders, Standing};
 use crate::events::{Event, EventKind};
 use crate::limits::{MAX_EVENTS, MAX_LOOKS};
 use crate::{MaterialTable, Tissue, V3};
 
 /// Step of looks ahead [mm].
-const LOOK_MM: f64 = 0.5;
+pub(crate) const LOOK_MM: f64 = 0.5;
 
 /// A place that the tip has passed.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,8 +50,8 @@ pub(crate) fn tell(told: &mut Told, event: Event) {
 pub struct Path {
     nodes: Vec<PathNode>,
     spacing_mm: f64,
-    /// layer that holds the tip now: force, and what is left of it [N, mm]
-    layer: Option<(f64, f64)>,
+    /// what was crossed, and the layer that may hold the tip
+    borders: Borders,
     /// part of Δd that the present tissue's spring does not see [mm]
     preload_mm: f64,
     /// the surface has given way
@@ -60,7 +63,7 @@ impl Path {
     pub(crate) fn new(spacing_mm: f64, length_mm: f64) -> Self {
         // neighbours may be half a spacing apart; breathing may stretch a path by half
         let room = ((3.0 * length_mm / spacing_mm) as usize + 8).min(crate::limits::MAX_PATH_NODES);
-        Self { nodes: Vec::with_capacity(room), spacing_mm, layer: None, preload_mm: 0.0, entered: false }
+        Self { nodes: Vec::with_capacity(room), spacing_mm, borders: Borders::default(), preload_mm: 0.0, entered: false }
     }
 
     /// Nodes from the skin to the tip.
@@ -99,7 +102,7 @@ impl Path {
 
     pub(crate) fn clear(&mut self) {
         self.nodes.clear();
-        self.layer = None;
+        self.borders.clear();
         self.preload_mm = 0.0;
         self.entered = false;
     }
@@ -115,15 +118,15 @@ impl Path {
     pub(crate) fn touch(&mut self, reference: V3, material: u8, table: &MaterialTable) {
         self.clear();
         self.nodes.push(PathNode { reference, material, slip_mm: 0.0 });
-        self.enter(material, table);
+        self.borders.enter(material, table.get(material), reference, 0.0);
     }
 
     /// Force at which the tip goes on [N].
     pub fn threshold_n(&self, table: &MaterialTable) -> f64 {
-        match (self.layer, self.nodes.last()) {
-            (Some((force, _)), _) => force,
-            (None, Some(tip)) => table.get(tip.material).cutting_force_n,
-            (None, None) => 0.0,
+        match (self.borders.standing(), self.nodes.last()) {
+            (_, None) => 0.0,
+            (Standing::Layer(force, _), _) => force,
+            (_, Some(tip)) => table.get(tip.material).cutting_force_n,
         }
     }
 
@@ -132,17 +135,13 @@ impl Path {
         self.nodes.last().map_or(0.0, |tip| table.get(tip.material).tip_force_n(deflection_mm - self.preload_mm))
     }
 
-    fn enter(&mut self, material: u8, table: &MaterialTable) {
-        self.layer = table.get(material).capsule.map(|c| (c.cutting_force_n, c.thickness_mm));
-    }
-
-    /// Moves the tip for a device that is Δd ahead along d (unit vector); returns how far it went [mm], negative for back. `fresh` is what relaxation has
-    /// left of the tip's force.
+    /// Moves the tip for a device that is Δd ahead along d (unit vector); returns how far it went [mm], negative for back. `relaxed_n` is what relaxation
+    /// has taken off the tip's force.
     pub(crate) fn follow<T: Tissue + ?Sized>(
         &mut self,
         delta_mm: f64,
         d: V3,
-        fresh: f64,
+        relaxed_n: f64,
         tissue: &T,
         table: &MaterialTable,
         told: &mut Told,
@@ -150,10 +149,10 @@ impl Path {
         if self.nodes.is_empty() || !delta_mm.is_finite() || delta_mm == 0.0 {
             return 0.0;
         }
-        if delta_mm < 0.0 { -self.retract(-delta_mm, tissue, told) } else { self.cut(delta_mm, d, fresh, tissue, table, told) }
+        if delta_mm < 0.0 { -self.retract(-delta_mm, tissue, told) } else { self.cut(delta_mm, d, relaxed_n, tissue, table, told) }
     }
 
-    fn cut<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, fresh: f64, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
+    fn cut<T: Tissue + ?Sized>(&mut self, delta_mm: f64, d: V3, relaxed_n: f64, tissue: &T, table: &MaterialTable, told: &mut Told) -> f64 {
         // a device that came back gives the spring its whole length again
         self.preload_mm = self.preload_mm.min(delta_mm);
         let look = LOOK_MM.max(delta_mm / (MAX_LOOKS / 2) as f64);
@@ -163,9 +162,8 @@ impl Path {
             let tip = self.nodes[l];
             let material = table.get(tip.material);
             let spring = left - self.preload_mm;
-            let force = material.tip_force_n(spring);
             let threshold = self.threshold_n(table);
-            if force < threshold {
+            if material.tip_force_n(spring) < threshold + relaxed_n {
                 break;
             }
             let told_here = |depth: f64, at: V3| Event {
@@ -174,15 +172,20 @@ impl Path {
                 reference_mm: at.into(),
                 depth_mm: depth,
                 // on its way through this tick's Δd the tip passed its threshold: more than that it never had
-                force_n: threshold * fresh,
+                force_n: threshold,
             };
-            if self.layer.is_some_and(|(_, thickness)| thickness <= 0.0) {
-                (self.layer, self.entered) = (None, true);
+            let standing = self.borders.standing();
+            if matches!(standing, Standing::Layer(_, thickness) if thickness <= 0.0) {
+                self.borders.give_way();
+                self.entered = true;
                 tell(told, told_here(self.length_mm(), tip.reference));
                 continue;
             }
-            let within = self.layer.map_or(f64::INFINITY, |(_, thickness)| thickness);
-            let step = (spring - material.deflection_mm(threshold)).min(look).min(within);
+            let within = match standing {
+                Standing::Free => f64::INFINITY,
+                Standing::Cut(way) | Standing::Layer(_, way) => way,
+            };
+            let step = (spring - material.deflection_mm(threshold + relaxed_n)).min(look).min(within);
             if step <= 1e-9 {
                 break;
             }
@@ -192,7 +195,7 @@ impl Path {
                 // p_1 stays on the skin
                 self.nodes.push(tip);
             }
-            if self.layer.is_none() && !self.entered {
+            if standing == Standing::Free && !self.entered {
                 // a surface without a layer of its own
                 self.entered = true;
                 tell(told, told_here(0.0, tip.reference));
@@ -201,29 +204,31 @@ impl Path {
             self.nodes[l].reference = to;
             (left, went) = (left - stepped, went + stepped);
             self.preload_mm = (self.preload_mm - stepped).max(0.0);
-            if let Some((_, thickness)) = &mut self.layer {
-                *thickness -= stepped;
-            }
+            let through = self.borders.went(stepped);
             if found != tip.material {
                 self.nodes[l].material = found;
-                self.enter(found, table);
-                let stands = self.layer.is_some() || table.get(found).cutting_force_n == f64::INFINITY;
-                let kind = if stands { EventKind::Contact } else { EventKind::Puncture };
-                tell(told, Event { kind, material: found, ..told_here(self.length_mm(), to) });
+                let depth = self.length_mm();
+                let before = self.borders.enter(found, table.get(found), to, depth);
+                let stands = self.borders.standing() != Standing::Free || table.get(found).cutting_force_n == f64::INFINITY;
+                // by a hole that is there nothing is punctured
+                if !before {
+                    let kind = if stands { EventKind::Contact } else { EventKind::Puncture };
+                    tell(told, Event { kind, material: found, ..told_here(depth, to) });
+                }
                 // same force on the other side of the border
                 let spring = left - self.preload_mm;
                 self.preload_mm = (left - table.get(found).deflection_mm(material.tip_force_n(spring))).clamp(0.0, left);
-            } else if within == step {
-                (self.layer, self.entered) = (None, true);
+            } else if through {
+                self.entered = true;
                 tell(told, told_here(self.length_mm(), to));
             }
-            self.place_nodes();
+            self.place_nodes(tissue);
         }
         went
     }
 
     /// The rule of 1.5·Δp, and the node on the skin when the tip leaves it.
-    fn place_nodes(&mut self) {
+    fn place_nodes<T: Tissue + ?Sized>(&mut self, tissue: &T) {
         let l = self.nodes.len() - 1;
         let tip = self.nodes[l];
         if l == 0 {
@@ -234,14 +239,15 @@ impl Path {
         let length = along.norm();
         if length > 1.5 * self.spacing_mm && self.nodes.len() < self.nodes.capacity() {
             let at = behind + along * (self.spacing_mm / length);
-            self.nodes[l].reference = at;
-            // it lies in what the tip has passed: the tissue of the tip but for one step
+            // of the tissue of its own place: a border may lie between it and the tip
+            self.nodes[l] = PathNode { reference: at, material: tissue.material_at(at.into()), ..tip };
             self.nodes.push(tip);
         }
     }
 
     fn retract<T: Tissue + ?Sized>(&mut self, by_mm: f64, tissue: &T, told: &mut Told) -> f64 {
-        (self.preload_mm, self.layer) = (0.0, None);
+        self.preload_mm = 0.0;
+        let was = self.nodes[self.nodes.len() - 1].material;
         let mut left = by_mm;
         // each round takes a node away or ends
         while left > 0.0 {
@@ -269,6 +275,11 @@ impl Path {
         // p_1 keeps what was found at the contact: it lies on the border
         if l > 0 {
             self.nodes[l].material = tissue.material_at(self.nodes[l].reference.into());
+        }
+        if self.nodes[l].material == was {
+            self.borders.went(-by_mm);
+        } else {
+            self.borders.leave(self.length_mm());
         }
         by_mm
     }

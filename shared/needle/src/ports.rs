@@ -63,6 +63,10 @@ pub struct Outputs {
     pub path_nodes: usize,
     /// tissue at the tip
     pub material: u8,
+    /// tissues that the shaft of a needle lies in that was found inside in this tick, a bit each by index: nobody saw it cut into them
+    pub found: u32,
+    /// work that the tissue's own motion did on needle and hand in this tick [mJ]
+    pub tissue_mj: f64,
     /// where the handle is (moved by breathing when let go)
     pub handle: HandlePose,
     /// how the rod's solve went

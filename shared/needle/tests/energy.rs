@@ -5,7 +5,7 @@
 mod common;
 
 use common::{DT, Random, config, half_space, straight, tick, with};
-use maille_needle::{AtRest, Gauge, HandlePose, Material, NeedleConfig, NeedleTool, Outputs, Q, RodParameters, V3};
+use maille_needle::{AtRest, Gauge, HandlePose, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, Q, RodParameters, V3};
 
 /// With the limits that a desktop device has: 3.3 N and 150 N·mm.
 fn tool() -> NeedleTool {
@@ -201,4 +201,82 @@ fn a_hand_gets_no_more_out_than_it_put_in() {
         assert!(led.end > 10.0, "cutting and friction take energy: {} N·mm", led.end);
     }
     println!("work of the hand less stored energy: at least {least:.3} N·mm");
+}
+
+#[test]
+fn a_pre_bent_needle_that_is_led_round_and_rolled_gives_nothing_out_either_way_round() {
+    // 18 gauge, 150 mm, bent over the last 60 mm, 60 mm deep: rolled by ±90° and moved by ±8 mm, a quarter of a period apart
+    let gauge = Gauge::of(18).unwrap();
+    for (radius, axis, friction) in [(120.0, 0, 0.025), (120.0, 1, 0.025), (300.0, 1, 1e-9), (f64::INFINITY, 0, 1e-9)] {
+        for way in [1.0, -1.0] {
+            let config = NeedleConfig::new(RodParameters::new(&gauge, 150.0));
+            let table = MaterialTable::new(&[Material { friction_n: friction, ..Material::LIVER_TRAINING }]).unwrap();
+            let mut tool = NeedleTool::with_rest(config, table, |s| [0.0, if s >= 90.0 { 1.0 / radius } else { 0.0 }, 0.0]).unwrap();
+            let pose = |side: f64, depth: f64, roll: f64| {
+                let q = Q::from_scaled_axis(V3::z() * roll);
+                let at = V3::z() * (depth - 150.0) + V3::ith(axis, side);
+                HandlePose { position_mm: at.into(), orientation_xyzw: [q.i, q.j, q.k, q.w] }
+            };
+            for n in 0..6000 {
+                tick(&mut tool, pose(0.0, -1.0 + 61.0 * f64::from(n) / 5999.0, 0.0), &AtRest, &half_space);
+            }
+            let period = 4.0;
+            let led = lead(&mut tool, (3.0 * period / DT) as usize, (period / DT) as usize, |t| {
+                let (rise, phase) = ((t / period).min(1.0), std::f64::consts::TAU * t / period);
+                pose(8.0 * rise * phase.cos(), 60.0, std::f64::consts::FRAC_PI_2 * rise * (1.0 + way * phase.sin()))
+            });
+            let rounds: Vec<f64> = led.rounds.windows(2).map(|w| w[1] - w[0]).collect();
+            println!(
+                "radius {radius}, along {axis}, {way:+} round: {:.2?} of the limits, least {:.4}, by rounds {rounds:.4?} mJ",
+                led.reached, led.least
+            );
+            assert!(led.least > -0.05 && rounds.iter().all(|mj| *mj > -0.02), "{} {rounds:?}", led.least);
+        }
+    }
+}
+
+/// Tissue that sways as a whole, across the needle and along it, over a second.
+struct Sway(f64);
+
+impl maille_needle::Breathing for Sway {
+    fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
+        let level = (std::f64::consts::TAU * self.0).sin();
+        // more the deeper it lies: it shears and stretches
+        let share = 0.5 + 0.005 * x[2].clamp(0.0, 100.0);
+        [8.0 * level * share, 3.0 * level, 0.15 * (2.0 * std::f64::consts::TAU * self.0).sin() * share]
+    }
+}
+
+#[test]
+fn work_of_hand_and_tissue_is_what_is_stored_while_nothing_slides_or_is_cut() {
+    let config = NeedleConfig { max_force_n: 100.0, max_torque_n_mm: 1e4, friction_slew_n_per_s: 1e6, ..config() };
+    // friction that holds: nothing slides
+    let mut tool = with(config, Material { friction_n: 10.0, cutting_force_n: 0.5, ..Material::LIVER_TRAINING });
+    for n in 0..3000 {
+        tick(&mut tool, straight(60.0 * f64::from(n) / 2999.0), &AtRest, &half_space);
+    }
+    // back, so that what lies before the tip is slack enough
+    for n in 0..200 {
+        tick(&mut tool, straight(60.0 - 0.001 * f64::from(n)), &AtRest, &half_space);
+    }
+    let first = tool.stored_n_mm();
+    let (mut hand, mut tissue, mut most, mut off) = (0.0, 0.0, 0.0f64, 0.0f64);
+    let mut before: Option<(HandlePose, Outputs)> = None;
+    for n in 0..2000 {
+        let t = f64::from(n) * DT;
+        // the hand moves too, in a time of its own
+        let pose = moved(59.8, [2.0 * (3.0 * t).sin(), 2.0 * (5.0 * t).sin()], [0.02 * (4.0 * t).sin(), 0.02 * (2.0 * t).sin()]);
+        let out = tick(&mut tool, pose, &Sway(t), &half_space);
+        if let Some((p, o)) = &before {
+            hand += work((p, o), (&pose, &out));
+        }
+        tissue += out.tissue_mj;
+        before = Some((pose, out));
+        let stored = tool.stored_n_mm() - first;
+        most = most.max(stored);
+        off = off.max((hand + tissue - stored).abs());
+    }
+    println!("stored up to {most:.2} mJ; hand {hand:.2} and tissue {tissue:.2} mJ in all; never off by more than {off:.3} mJ");
+    // what is off: the needle's own drag, and springs across the path that turn with it
+    assert!(tissue.abs() > 5.0 && most > 3.0 && off < 0.12 * most && off < 0.05 * tissue.abs(), "{off} of {most}");
 }

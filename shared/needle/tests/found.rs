@@ -45,6 +45,8 @@ fn lead(tool: &mut NeedleTool, from: f64, to: f64, mm_per_s: f64) -> Vec<Event> 
 /// Just found 55 mm deep: one event, its tissue, no force, a path that reaches from the skin to the tip; and the hand goes on from there.
 fn is_found(tool: &mut NeedleTool, told: &[Event], out: &Outputs) {
     assert_eq!(told.len(), 1, "{told:?}");
+    // what the shaft lies in: skin, liver, and the vessel, thinner than a node's spacing
+    assert_eq!(out.found, 1 << 1 | 1 << 2 | 1 << 3);
     assert!(told[0].kind == EventKind::Found && told[0].material == 2 && told[0].force_n == 0.0, "{told:?}");
     assert!((told[0].depth_mm - 55.0).abs() < 0.01 && (out.depth_mm - 55.0).abs() < 0.01);
     assert!(V3::from(out.force_n).norm() < 0.02 && out.cutting_n < 0.02, "{out:?}");

@@ -5,7 +5,7 @@
 mod common;
 
 use common::{config, half_space, needle, straight, tick, with};
-use maille_needle::{AtRest, Capsule, EventKind, HandlePose, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, V3};
+use maille_needle::{AtRest, Breathing, Capsule, EventKind, HandlePose, Material, MaterialTable, NeedleConfig, NeedleTool, Outputs, V3};
 
 fn drive(tool: &mut NeedleTool, from: f64, to: f64, step: f64, mut each: impl FnMut(&NeedleTool, &Outputs)) {
     let count = ((to - from).abs() / step).ceil() as i32;
@@ -207,5 +207,111 @@ fn answers_do_not_depend_on_the_number_of_nodes() {
         println!("{nodes} nodes: {f:?} {t:?} {tip:?}");
         assert!((f - fine.0).norm() < 0.01 * fine.0.norm() && (t - fine.1).norm() < 0.01 * fine.1.norm(), "{nodes}: {f} {}", fine.0);
         assert!((tip - fine.2).norm() < 0.02);
+    }
+}
+
+/// Skin of 1.2 N over 1.5 mm; 0.25 N behind it.
+fn skin() -> Material {
+    let layer = Capsule { cutting_force_n: 1.2, thickness_mm: 1.5 };
+    Material { capsule: Some(layer), cutting_force_n: 0.25, friction_n: 1e-9, ..Material::LIVER_TRAINING }
+}
+
+#[test]
+fn a_layer_that_is_cut_half_way_stays_cut_half_way_when_the_hand_steps_back() {
+    let mut tool = with(NeedleConfig { max_force_n: 3.3, ..config() }, skin());
+    // 1.2 N are held by a millimetre of spring: 0.5 mm of the skin are cut
+    drive(&mut tool, -1.0, 1.5, 0.005, |_, out| assert!(out.events.iter().flatten().all(|e| e.kind == EventKind::Contact)));
+    let cut = tool.path().length_mm();
+    assert!((cut - 0.5).abs() < 1e-6, "{cut}");
+    // back until the tip goes back too, as it does by 0.3 mm, and in again
+    drive(&mut tool, 1.5, 0.2, 0.005, |_, _| {});
+    let (mut peak, mut events) = (0.0f64, Vec::new());
+    drive(&mut tool, 0.2, 6.0, 0.005, |tool, out| {
+        peak = peak.max(out.cutting_n);
+        events.extend(out.events.iter().flatten().map(|e| (e.kind, e.depth_mm, e.force_n)));
+        // the way that is cut takes what the tissue behind takes, no layer
+        assert!(tool.path().length_mm() > cut - 1e-6 || out.cutting_n < 0.25 + 1e-9, "{} at {}", out.cutting_n, tool.path().length_mm());
+    });
+    println!("in again: at most {peak:.3} N, {events:?}");
+    assert!((peak - 1.2).abs() < 0.01);
+    let [(kind, depth, force)] = events[..] else { panic!("{events:?}") };
+    assert!(kind == EventKind::Puncture && (depth - 1.5).abs() < 1e-6 && (force - 1.2).abs() < 1e-9);
+}
+
+/// Tissue that moves along the needle as a whole.
+struct Up(f64);
+
+impl Breathing for Up {
+    fn displacement(&self, _: [f64; 3]) -> [f64; 3] {
+        [0.0, 0.0, self.0]
+    }
+}
+
+#[test]
+fn a_breath_punctures_nothing_for_a_hand_at_rest() {
+    // in the skin's layer, just before a capsule, and through it: tissue comes and goes by a millimetre and a half
+    let capsule = Capsule { cutting_force_n: 0.8, thickness_mm: 0.0 };
+    let soft = Material { cutting_force_n: 0.25, friction_n: 1e-9, ..Material::LIVER_TRAINING };
+    let layers = |x: [f64; 3]| if x[2] < 0.0 { 0 } else { 1 + u8::from(x[2] >= 10.0) };
+    for (rest, through) in [(1.9, false), (10.3, false), (11.2, true)] {
+        let table = MaterialTable::new(&[skin(), Material { capsule: Some(capsule), ..soft }]).unwrap();
+        let mut tool = NeedleTool::new(config(), table).unwrap();
+        let mut events = Vec::new();
+        for n in 0..16_000 + 12_000 {
+            let t = f64::from(n) * common::DT;
+            let level = if n < 16_000 { 0.0 } else { 0.75 * (1.0 - (std::f64::consts::TAU * (t - 16.0) / 4.0).cos()) };
+            let out = tick(&mut tool, straight((t - 1.0).min(rest)), &Up(level), &layers);
+            if n >= 16_000 {
+                events.extend(out.events.iter().flatten().copied());
+            }
+        }
+        println!("resting at {rest} mm: {events:?}");
+        assert!(events.iter().all(|e| e.kind != EventKind::Puncture), "{rest}: {events:?}");
+        // what it was through it is not held up by again
+        assert!(through || tool.path().tip().unwrap().reference.z < 10.01);
+    }
+}
+
+#[test]
+fn every_node_has_the_tissue_of_its_own_place() {
+    for border in [30.3, 31.0, 32.0, 32.4] {
+        let tissue = move |x: [f64; 3]| if x[2] < 0.0 { 0u8 } else { 1 + u8::from(x[2] >= border) };
+        let soft = Material { friction_n: 1e-9, ..Material::LIVER_TRAINING };
+        let table = MaterialTable::new(&[soft, Material { friction_n: 0.2, ..soft }]).unwrap();
+        let mut tool = NeedleTool::new(NeedleConfig { device_n_per_mm: 10.0, ..config() }, table).unwrap();
+        for n in 0..5000 {
+            tick(&mut tool, straight(f64::from(n) * 0.01 - 1.0), &AtRest, &tissue);
+        }
+        // the first lies on the skin, and is told as what was met there
+        for node in &tool.path().nodes()[1..] {
+            assert_eq!(node.material, tissue(node.reference.into()), "border {border}, node at {}", node.reference.z);
+        }
+    }
+}
+
+#[test]
+fn a_spring_that_has_relaxed_is_stretched_further_and_a_layer_takes_what_it_took() {
+    for relaxing in [0.0, 0.4, 0.95] {
+        let material = Material { relaxing, relaxation_s: 0.2, ..skin() };
+        let mut tool = with(NeedleConfig { max_force_n: 3.3, ..config() }, material);
+        drive(&mut tool, -1.0, 0.9, 0.005, |_, _| {});
+        let before = tick(&mut tool, straight(0.9), &AtRest, &half_space).cutting_n;
+        for _ in 0..3000 {
+            tick(&mut tool, straight(0.9), &AtRest, &half_space);
+        }
+        // rested: a part of 1.08 N is gone
+        let rested = tick(&mut tool, straight(0.9), &AtRest, &half_space).cutting_n;
+        assert!((rested - (1.0 - relaxing) * 1.08).abs() < 1e-3 && before > rested - 1e-9, "{relaxing}: {before} {rested}");
+        let (mut peak, mut told) = (0.0f64, None);
+        // as a hand goes on, 100 mm/s
+        drive(&mut tool, 0.9, 8.0, 0.1, |_, out| {
+            peak = peak.max(out.cutting_n);
+            told = told.or(out.events.iter().flatten().find(|e| e.kind == EventKind::Puncture).copied());
+        });
+        let told = told.unwrap();
+        println!("relaxing by {relaxing}: {rested:.2} N after the rest, then at most {peak:.3} N, told {:.3} N", told.force_n);
+        assert!((told.force_n - 1.2).abs() < 1e-9 && told.depth_mm > 1.4);
+        // cutting a tenth of a millimetre in a tick makes a tenth of 2 N fresh, and the tip follows in the next
+        assert!((1.19..1.21 + 0.2 * relaxing).contains(&peak), "{peak}");
     }
 }

@@ -4,7 +4,9 @@
 //! neighbours stands an angular spring of the *continuum's* stiffness [Goksel, Dehghan & Salcudean 2009 for angular springs; Bergou et al.
 //! 2008 for the discrete rod]: with φ_i = log(R_{i−1}ᵀ R_i) and l the length between the middles of the two segments,
 //!
-//!   E_i = (φ_i − φ̄_i)ᵀ diag(EI, EI, GJ) (φ_i − φ̄_i) / 2l,     φ̄_i = l·κ̄(s_i) the rest shape (pre-bent, bevelled).
+//!   E_i = (φ_i − φ̄_i)ᵀ diag(EI, EI, GJ) (φ_i − φ̄_i) / 2l,     φ̄_i = ∫_l κ̄ ds the rest shape (pre-bent, bevelled),
+//!
+//! so that a needle whose bend begins anywhere is bent as much with any number of nodes.
 //!
 //! A gripped end is half a segment from its frame (l = h/2), which makes angles those of the middles of segments and the whole model of second
 //! order. EI and GJ are the parameters; the number of nodes is a matter of resolution only.
@@ -168,6 +170,13 @@ impl Shape {
     }
 }
 
+/// What a rest shape turns by between two arc lengths [rad]: the midpoint rule on a thousand pieces, as a bend may begin anywhere between.
+fn integral(curvature: &impl Fn(f64) -> [f64; 3], from: f64, to: f64) -> V3 {
+    const PIECES: u32 = 1000;
+    let piece = (to - from) / f64::from(PIECES);
+    (0..PIECES).map(|n| V3::from(curvature(from + (f64::from(n) + 0.5) * piece)) * piece).sum()
+}
+
 impl Rod {
     /// A straight rod along z from the origin, clamped there, with room for so many attachments.
     ///
@@ -193,13 +202,9 @@ impl Rod {
         let h = p.length_mm / m as f64;
         let mut rest = Vec::with_capacity(m + 1);
         for joint in 0..=m {
-            // half a segment at the ends: the mean of the curvature there is that at a quarter
-            let (arc, length) = match joint {
-                0 => (0.25 * h, 0.5 * h),
-                j if j == m => (p.length_mm - 0.25 * h, 0.5 * h),
-                j => (j as f64 * h, h),
-            };
-            let turn = V3::from(curvature(arc)) * length;
+            // a joint bends as the needle does from the middle of one segment to that of the next; half a segment at the ends
+            let (from, to) = ((joint as f64 - 0.5).max(0.0) * h, (joint as f64 + 0.5).min(m as f64) * h);
+            let turn = integral(&curvature, from, to);
             check("rest curvature", turn.norm(), "at most one radian from node to node", turn.norm() <= 1.0)?;
             rest.push(turn);
         }
@@ -327,6 +332,11 @@ impl Rod {
     /// Force of the needle on its grip [N].
     pub fn force_on_grip_n(&self) -> V3 {
         self.grip.stiffness_n_per_mm * (self.shape.nodes[0] - self.grip.position_mm)
+    }
+
+    /// Force of the needle on what an attachment's spring pulls to [N]; attachments by arc length from the base.
+    pub fn force_on_target_n(&self, attachment: usize) -> Option<V3> {
+        self.attachments.get(attachment).map(|a| a.stiffness_n_per_mm * (self.point(a.arc_mm) - a.target_mm))
     }
 
     /// Moment of the needle on its grip [N·mm].

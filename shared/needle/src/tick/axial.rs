@@ -9,6 +9,13 @@
 //!
 //! **What a device can overcome.** Friction of a path as a whole is held to [`FRICTION_SHARE`] of the largest force, by ρ ≤ 1 before each R: a needle that a
 //! hand could push in and never draw out again would be stuck.
+//!
+//! **Relaxation** of the tip's force is that of a standard linear solid: of F(Δd) a part f_r is gone, which goes to r·F(Δd) with the time constant τ, and to
+//! nothing within [`FRESH_MM`] of tissue that was not stretched before:
+//!
+//!   f = F(Δd) − f_r,   ḟ_r = (r·F(Δd) − f_r)/τ,   f_r ← f_r·exp(−cut/FRESH_MM).
+//!
+//! The tip cuts where f is f_cut: tissue that has relaxed is stretched further and takes what it took. Friction decays by one share for the whole path.
 
 use super::NeedleTool;
 use crate::AIR;
@@ -84,16 +91,21 @@ impl NeedleTool {
         (1..self.path.nodes().len()).map(|i| self.friction_stiffness(i) * self.path.nodes()[i].slip_mm).sum()
     }
 
-    /// What is left of forces after relaxation.
-    pub(super) fn fresh(&self) -> f64 {
+    /// What is left of friction after relaxation.
+    fn fresh(&self) -> f64 {
         self.path.tip().map_or(1.0, |tip| 1.0 - self.table.get(tip.material).relaxing * self.relaxed)
     }
 
-    /// Relaxation while the tip rests, undone by cutting.
-    pub(super) fn relax(&mut self, went: f64, dt: f64) {
+    /// Relaxation while the tip rests, undone by cutting. `ahead` is Δd of now.
+    pub(super) fn relax(&mut self, went: f64, ahead: f64, dt: f64) {
         let Some(tip) = self.path.tip() else { return };
-        let rest = (1.0 - self.relaxed) * (1.0 - (-dt / self.table.get(tip.material).relaxation_s).exp());
-        self.relaxed = ((self.relaxed + rest) * (-went / FRESH_MM).exp()).clamp(0.0, 1.0);
+        let material = *self.table.get(tip.material);
+        let part = 1.0 - (-dt / material.relaxation_s).exp();
+        let kept = (-went / FRESH_MM).exp();
+        self.relaxed = ((self.relaxed + (1.0 - self.relaxed) * part) * kept).clamp(0.0, 1.0);
+        let whole = material.tip_force_n(ahead - self.path.preload_mm());
+        // tissue pulls no tip in: what has relaxed is never more than what there is
+        self.relaxed_n = ((self.relaxed_n + (material.relaxing * whole - self.relaxed_n) * part) * kept).clamp(0.0, whole);
     }
 
     /// A needle that nobody holds goes back until the tip's spring and friction balance; Δd then.
@@ -106,14 +118,14 @@ impl NeedleTool {
             + (1..self.path.nodes().len()).map(|i| self.friction_stiffness(i)).sum::<f64>();
         let back = -force / stiffness * (dt / (dt + SETTLE_S));
         // it neither cuts nor leaves: its tip rests in its tissue
-        let most = self.path.preload_mm() + tip.deflection_mm(self.path.threshold_n(&self.table));
+        let most = self.path.preload_mm() + tip.deflection_mm(self.path.threshold_n(&self.table) + self.relaxed_n);
         (self.ahead_mm + back).clamp(0.0, most.max(0.0))
     }
 
     /// Cutting and friction [N] of this tick.
     pub(super) fn axial(&mut self, dt: f64) -> (f64, f64) {
         let fresh = self.fresh();
-        let cutting = self.path.tip_force_n(self.ahead_mm, &self.table) * fresh;
+        let cutting = (self.path.tip_force_n(self.ahead_mm, &self.table) - self.relaxed_n).max(0.0);
         let most = self.config.friction_slew_n_per_s * dt;
         let wanted = self.friction_wanted() * fresh;
         self.friction_n += (wanted - self.friction_n).clamp(-most, most);

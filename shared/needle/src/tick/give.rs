@@ -7,7 +7,6 @@
 //! of nothing, and a hand led round gets energy out of it. With the paper's device tip ([`DeviceTip::Rigid`]) the paper's directions are kept.
 
 use super::NeedleTool;
-use crate::V3;
 use crate::config::DeviceTip;
 use crate::ports::Outputs;
 
@@ -31,9 +30,7 @@ impl NeedleTool {
             }
         };
         let wanted = base + along;
-        let handle = self.orientation * V3::z();
-        let moment = self.rod.moment_on_grip_n_mm();
-        let [force, torque] = self.hold_back(wanted, moment - handle * moment.dot(&handle));
+        let [force, torque] = self.hold_back(wanted, self.rod.moment_on_grip_n_mm());
         (out.force_n, out.torque_n_mm) = (force.into(), torque.into());
         let share = if wanted.norm() > force.norm() { force.norm() / wanted.norm() } else { 1.0 };
         (out.cutting_n, out.friction_n, out.base_n) = (cutting * share, friction * share, base.norm() * share);

@@ -61,10 +61,12 @@ impl NeedleTool {
             compliance_rad_per_n_mm: if held { 1.0 / self.config.grip_n_mm_per_rad } else { f64::INFINITY },
         };
         self.rod.clear_attachments();
+        self.not_reached = 0;
         let end = self.arc[count - 1];
         for i in 0..count {
             let arc = length - (end - self.arc[i]);
             if arc < 0.0 {
+                self.not_reached = i + 1;
                 continue;
             }
             let node = self.path.nodes()[i];

@@ -27,13 +27,14 @@
 //! friction and the tip's spring balance, and the handle is where its base is. The rod's drag is then against the tissue at its tip, not against the world:
 //! else a breath would drag it behind.
 //!
-//! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre.
+//! **Relaxation.** While the tip rests, a part of its force and of friction decays (`Material::relaxing`); cutting makes it fresh within a millimetre. See `axial`.
 //!
 //! Units: mm, N, N·mm, s; frame: world, where not said otherwise. Degraded modes: a pose that is not finite or whose quaternion is none → the last
 //! one stands, counted; jumps are counted, and the path is laid anew; a path that is full stops the tip's nodes, not
 //! the needle. Cost: 10–20 µs with 25 nodes. Allocation: none. Not here: slew limits and fading (`maille-contact`), where tissue comes from.
 
 mod axial;
+mod breath;
 mod drag;
 mod give;
 mod hold;
@@ -66,6 +67,9 @@ pub struct NeedleTool {
     position: V3,
     orientation: Q,
     hold: Hold,
+    moved: breath::Moved,
+    /// nodes of the path, from the skin on, that the needle does not reach
+    not_reached: usize,
     seen: bool,
     /// distance from handle to point of the unloaded needle, by node [mm]; none where it is straight
     chords: Vec<f64>,
@@ -77,8 +81,10 @@ pub struct NeedleTool {
     ahead_mm: f64,
     /// w_l at the last tick, while nobody holds the needle [mm]
     carried: Option<V3>,
-    /// share of the tip's memory that has relaxed, 0 … 1
+    /// share of friction's memory that has relaxed, 0 … 1
     relaxed: f64,
+    /// what has relaxed of the force at the tip [N]
+    relaxed_n: f64,
     /// σ of the friction springs, see `axial`
     softened: f64,
     /// ρ of their limits, see `axial`
@@ -121,12 +127,15 @@ impl NeedleTool {
             position: V3::zeros(),
             orientation: Q::identity(),
             hold: Hold::new(),
+            moved: breath::Moved::new(room),
+            not_reached: 0,
             seen: false,
             reference: V3::zeros(),
             inserted_mm: None,
             ahead_mm: 0.0,
             carried: None,
             relaxed: 0.0,
+            relaxed_n: 0.0,
             softened: 1.0,
             smoothed: 1.0,
             friction_n: 0.0,
@@ -177,9 +186,7 @@ impl NeedleTool {
             self.path.clear();
             self.leave();
         }
-        if self.path.nodes().is_empty() {
-            self.look_for_skin(inputs, anew, &mut told);
-        }
+        let found = if self.path.nodes().is_empty() { self.look_for_skin(inputs, anew, &mut told) } else { 0 };
         if let (Some(tip), true) = (left, self.path.nodes().is_empty()) {
             tell(&mut told, Event::withdrawn(&tip));
         }
@@ -187,6 +194,7 @@ impl NeedleTool {
         if !self.path.nodes().is_empty() {
             self.inside(inputs, held, dt, &mut told, &mut out);
         }
+        out.found = found;
         out.path_nodes = self.path.nodes().len();
         out.handle = HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() };
         out.events = told;
@@ -210,6 +218,8 @@ impl NeedleTool {
             ahead_mm: 0.0,
             path_nodes: 0,
             material: AIR,
+            found: 0,
+            tissue_mj: 0.0,
             handle: HandlePose { position_mm: self.position.into(), orientation_xyzw: self.orientation.coords.into() },
             solved: Solved { converged: true, ..Solved::default() },
             events: [None; crate::limits::MAX_EVENTS],
@@ -251,7 +261,9 @@ impl NeedleTool {
     ) {
         let length = self.config.rod.length_mm;
         // arc lengths of the last tick, then those of this one: what tissue did along the needle
-        let skin = self.carry(inputs.breathing);
+        let stored = if held { 0.0 } else { self.stored_n_mm() };
+        let skin = self.breathe(inputs.breathing);
+        let before = self.work_of_breath();
         let axis = self.rod.tip_tangent();
         let inserted = if held { length - self.outside_mm(skin) } else { self.arc_of_tip() + self.ahead_mm };
         let forward = inserted - self.inserted_mm.unwrap_or(inserted);
@@ -269,18 +281,18 @@ impl NeedleTool {
             };
             self.reference = inputs.breathing.to_reference(device.into(), (tip + direction * ahead).into()).into();
             ahead = (self.reference - tip).dot(&direction);
-            let went = self.path.follow(ahead, direction, self.fresh(), inputs.tissue, &self.table, told);
+            let went = self.path.follow(ahead, direction, self.relaxed_n, inputs.tissue, &self.table, told);
             if self.path.nodes().is_empty() {
                 self.leave();
                 *out = self.outside();
                 return;
             }
             ahead = (ahead - went).max(0.0);
-            self.relax(went.abs(), dt);
+            self.relax(went.abs(), ahead, dt);
             self.faults.path_full += u64::from(self.path.nodes().len() == self.path.capacity());
         } else {
-            self.relax(0.0, dt);
             ahead = self.settle(dt);
+            self.relax(0.0, ahead, dt);
         }
         self.ahead_mm = ahead;
         // proxies of the nodes that are there now
@@ -295,6 +307,7 @@ impl NeedleTool {
         if !held {
             self.hang();
         }
+        out.tissue_mj = if held { 0.5 * (before + self.work_of_breath()) } else { (self.stored_n_mm() - stored).max(0.0) };
         self.give(held, cutting, friction, out);
         let tip = &self.path.nodes()[self.path.nodes().len() - 1];
         out.tip_reference_mm = tip.reference.into();

@@ -2,31 +2,37 @@
 //!
 //! A tip that comes into tissue within one tick lies on its skin: back along the needle to where it is outside, the first node is there. A needle that was
 //! not led there lies in a path that nobody saw cut. Its nodes are laid along the needle's own shape, carried to rest, a spacing apart from skin to tip;
-//! its springs are at rest, no layer stands before it, and the tissue of its tip is told, not what lies between.
+//! its springs are at rest, and no layer stands before it. The tissue of its tip is told as an event; all that it lies in, looked at every half a millimetre,
+//! as a set ([`crate::Outputs::found`]): what was gone through while nobody looked was gone through.
 
 use super::{NeedleTool, slip::MAX_JUMP_MM};
 use crate::events::{Event, EventKind};
-use crate::limits::{MAX_PATH_NODES, MAX_SKIN_HALVINGS, MAX_SKIN_STEPS};
-use crate::path::{Told, tell};
+use crate::limits::{MAX_LOOKS, MAX_PATH_NODES, MAX_SKIN_HALVINGS, MAX_SKIN_STEPS};
+use crate::path::{LOOK_MM, Told, tell};
 use crate::ports::Inputs;
 use crate::{AIR, Breathing, Tissue, V3};
 
 /// A needle that was not led is found inside where its tip is deeper than this [mm]; else it touches the skin.
 const TOUCH_MM: f64 = 1.0;
 
+fn bit(material: u8) -> u32 {
+    1u32.checked_shl(material.into()).unwrap_or(0)
+}
+
 impl NeedleTool {
-    /// Needle in the air: its rest shape on the handle. First contact with the skin makes the first path node.
+    /// Needle in the air: its rest shape on the handle. First contact with the skin makes the first path node. Of a needle that is found inside: what it
+    /// lies in, a bit each.
     pub(super) fn look_for_skin<B: Breathing + ?Sized, T: Tissue + ?Sized>(
         &mut self,
         inputs: &Inputs<'_, B, T>,
         anew: bool,
         told: &mut Told,
-    ) {
+    ) -> u32 {
         self.in_air();
         self.rod.lay(self.position, self.orientation);
-        (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed) = (None, 0.0, 0.0, 0.0);
+        (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed, self.relaxed_n) = (None, 0.0, 0.0, 0.0, 0.0);
         if !self.seen {
-            return;
+            return 0;
         }
         let length = self.config.rod.length_mm;
         let tip = self.rod.point(length);
@@ -34,7 +40,7 @@ impl NeedleTool {
         self.reference = inputs.breathing.to_reference(tip.into(), guess.into()).into();
         let inside = inputs.tissue.material_at(self.reference.into());
         if inside == AIR {
-            return;
+            return 0;
         }
         // back along the needle to where it is outside
         let at_rest = |back: f64, guess: V3| V3::from(inputs.breathing.to_reference(self.rod.point(length - back).into(), guess.into()));
@@ -58,7 +64,7 @@ impl NeedleTool {
         }
         let Some(mut air) = found else {
             self.faults.buried += 1;
-            return;
+            return 0;
         };
         let mut skin = deep;
         for _ in 0..MAX_SKIN_HALVINGS {
@@ -73,7 +79,7 @@ impl NeedleTool {
         if skin <= TOUCH_MM || (!anew && skin <= MAX_JUMP_MM) {
             self.path.touch(at, material, &self.table);
             tell(told, Event { kind: EventKind::Contact, material, reference_mm: at.into(), depth_mm: 0.0, force_n: 0.0 });
-            return;
+            return 0;
         }
         let pieces = ((skin / self.path.spacing_mm()).ceil() as usize).clamp(1, self.path.capacity().min(MAX_PATH_NODES) - 1);
         let mut last = at;
@@ -86,12 +92,28 @@ impl NeedleTool {
         }));
         let depth_mm = self.path.length_mm();
         tell(told, Event { kind: EventKind::Found, material: inside, reference_mm: self.reference.into(), depth_mm, force_n: 0.0 });
+        self.lies_in(inputs.tissue)
+    }
+
+    /// Tissues along the path, a bit each.
+    fn lies_in<T: Tissue + ?Sized>(&self, tissue: &T) -> u32 {
+        let nodes = self.path.nodes();
+        let mut found = nodes.iter().fold(0u32, |bits, node| bits | bit(node.material));
+        for w in nodes.windows(2) {
+            let piece = w[1].reference - w[0].reference;
+            let looks = (piece.norm() / LOOK_MM).ceil().min(MAX_LOOKS as f64) as usize;
+            for n in 1..looks {
+                found |= bit(tissue.material_at((w[0].reference + piece * (n as f64 / looks as f64)).into()));
+            }
+        }
+        found
     }
 
     /// The needle has left the patient.
     pub(super) fn leave(&mut self) {
         self.in_air();
-        (self.inserted_mm, self.ahead_mm, self.friction_n, self.relaxed, self.carried) = (None, 0.0, 0.0, 0.0, None);
+        (self.inserted_mm, self.ahead_mm, self.friction_n, self.carried) = (None, 0.0, 0.0, None);
+        (self.relaxed, self.relaxed_n) = (0.0, 0.0);
         self.arc.clear();
         self.world.clear();
         self.rod.lay(self.position, self.orientation);

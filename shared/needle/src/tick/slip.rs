@@ -16,7 +16,12 @@
 //!
 //! and alike for torque and the turn σ = log(R_v R_hᵀ). No such step raises W: the grip's springs are what E depends on v by, so that κ = their stiffness
 //! across and for turns, and the device's bound for all that is elastic along, majorise its second derivatives. Below the limits v = h, bit by bit. At
-//! them, v stands in the world while the hand goes on. About the needle's axis v always turns as the hand does: no torque is given there.
+//! them, v stands in the world while the hand goes on.
+//!
+//! **About the axis** no torque is given (algorithm 1, line 15): a limit of nought. A hand that turned a needle about its axis against tissue would do work there
+//! that it does not feel. A straight needle turns as the hand does, for it turns in its path at no cost. One with a rest shape turns freely between the fingers
+//! while it is in tissue: v follows the hand's axis by the shortest turn, which the torque across the axis pays for, and rolls by its own torque about
+//! it, ψ ← ψ + w·e/κ, downhill in E. So whatever way round such a needle is led and rolled, no more comes out than went in. In the air it is as the hand has it.
 //!
 //! Units: mm, N, N·mm, rad; frame: world. Cost: constant. Allocation: none. Not here: that a force is held for a tick (`device_n_per_mm`).
 
@@ -32,6 +37,9 @@ pub(super) const MAX_JUMP_MM: f64 = 10.0;
 const REACH_MM: f64 = 30.0;
 /// A move by more than this in a tick that took longer than is believed is none that was followed [mm].
 const STALL_MM: f64 = 1.0;
+
+/// A needle that rolls freely does so by no more than this in a tick [rad].
+const MAX_ROLL: f64 = 0.05;
 
 /// Where the hand is, and how far the needle's handle is from there.
 #[derive(Clone, Copy, Debug)]
@@ -81,17 +89,25 @@ impl NeedleTool {
         let anew = !self.seen || jumped || stalled;
         let [mut at, mut frame] = [taken_up; 2];
         let was = (hold.hand + hold.off[0], Q::from_scaled_axis(hold.off[1]) * hold.hand_turn);
+        // a needle that rolls freely has a roll of its own about that axis
+        let rolls = !self.chords.is_empty() && !self.path.nodes().is_empty();
+        let was_frame = if rolls && !taken_up { led(&self.orientation, &(was.1 * V3::z())) } else { was.1 };
         at |= hold.off[0] != V3::zeros();
         frame |= hold.off[1] != V3::zeros();
         (hold.hand, hold.hand_turn, hold.held, self.seen) = (position, turn, true, true);
         if !taken_up {
-            (self.position, self.orientation) = was;
+            (self.position, self.orientation) = (was.0, was_frame);
         }
         if !at || anew {
             self.position = position;
         }
-        if !frame || anew {
+        if anew || !(frame || rolls) {
             self.orientation = turn;
+        } else if rolls {
+            // a tilt that the hand had given way by stands in the world
+            if !frame {
+                self.orientation = led(&self.orientation, &(turn * V3::z()));
+            }
         } else {
             self.orientation = Q::from_scaled_axis(self.turned_off()) * turn;
             self.orientation.renormalize();
@@ -103,8 +119,7 @@ impl NeedleTool {
     /// σ = log(R_v R_hᵀ) without its part about the hand's axis.
     fn turned_off(&self) -> V3 {
         let axis = self.hold.hand_turn * V3::z();
-        let by = (self.orientation * self.hold.hand_turn.inverse()).scaled_axis();
-        by - axis * axis.dot(&by)
+        shortest(&axis, &(self.orientation * V3::z())).scaled_axis()
     }
 
     /// What the hand is given for the needle's force and torque on its handle, and where that handle goes.
@@ -116,8 +131,15 @@ impl NeedleTool {
         }
         let (force, off) = step(self.position - self.hold.hand, force, c.max_force_n, c.device_n_per_mm);
         let turned = if self.orientation == self.hold.hand_turn { V3::zeros() } else { self.turned_off() };
-        let axis = self.hold.hand_turn * V3::z();
+        // none about the needle's axis, and none about the hand's where the hand gave way
+        let (own, axis) = (self.orientation * V3::z(), self.hold.hand_turn * V3::z());
+        let about = own.dot(&torque);
+        let torque = torque - own * about;
         let torque = torque - axis * axis.dot(&torque);
+        if !self.chords.is_empty() {
+            let roll = (about / c.grip_n_mm_per_rad).clamp(-MAX_ROLL, MAX_ROLL);
+            self.orientation = Q::from_scaled_axis(own * roll) * self.orientation;
+        }
         let (torque, turned) = step(turned, torque, c.max_torque_n_mm, c.grip_n_mm_per_rad);
         self.hold.off = [off, turned];
         [force, torque]
@@ -136,6 +158,19 @@ impl NeedleTool {
         }
         self.config.max_force_n * (self.position - self.hold.hand).norm() + self.config.max_torque_n_mm * self.turned_off().norm()
     }
+}
+
+/// The shortest turn from one direction to another.
+fn shortest(from: &V3, to: &V3) -> Q {
+    // none is shortest between opposites
+    Q::rotation_between(from, to).unwrap_or_else(Q::identity)
+}
+
+/// A frame after its z axis was led to `axis` by the shortest turn.
+fn led(frame: &Q, axis: &V3) -> Q {
+    let mut turned = shortest(&(frame * V3::z()), axis) * frame;
+    turned.renormalize();
+    turned
 }
 
 /// One proximal step: what is given, and what is off then.
