@@ -32,7 +32,7 @@
 //! | `services.rendering.coarse_frames` | frames whose 3D view was drawn more coarsely than the scene asks for, to be in time |
 //! | `services.rendering.gpu` | in a scene with `backend = "gpu"`: `frames` all of whose pictures it drew, `failures`: pictures that the CPU drew in its place, and starts without it |
 //! | `services.rendering.warp` | in a scene that breathes: `unsettled` nodes of all frames' warps, `error_mm`, how far from its place anything in a frame may be drawn: `p50`, `p99`, `p999`, `max` |
-//! | `breathing` | in a scene that breathes: `signal` that leads it, `longest_mm` of the fields, and of a recorded trace `recording`: `breaths`, `period_s`, `ends` [the file's unit], `duration_s`, `loop_s` before it repeats, `rows` played, `rows_left_out` that were no measurement or out of reach, `gaps` (longer than three sampling periods), `longest_gap_s`, `delay_s` of the filter |
+//! | `breathing` | in a scene that breathes: `signal` that leads it, `longest_mm` of the fields, and of a recorded trace `recording`: `breaths`, `period_s`, `ends` [the file's unit], `duration_s`, `loop_s` before it repeats, `rows` played, `rows_left_out` that were no measurement or out of reach, `gaps` (longer than three sampling periods), `longest_gap_s`, `leaps` of the clock (10 s and more, closed up), `longest_leap_s`, `delay_s` of the filter |
 //! | `store.voxels_mib` | voxels of the volume, 2 bytes each |
 //! | `store.segment_mib` | all segments of the run in /dev/shm |
 //! | `store.segments_mib` | the same by segment; `messages` is what iceoryx2 made for them |

@@ -4,13 +4,13 @@
 //! wherever it does not separate. Time is the column of that name, else the first whose header has "time", else the first; it is in
 //! milliseconds when its header says so or when samples lie 2 or more apart (nothing slower than that shows breathing in seconds). Columns named frame, index or sample
 //! are no values. Of several value columns the signal is their first principal axis (a marker moves along one line in space), signed
-//! so that it dwells at its low end, where breathing rests.
+//! so that it dwells at its low end, where breathing rests; rows in which a coordinate was lost or leaps are left out before (`super::axis`).
 //!
 //! Rows that are all zeros, or whose cells are empty or no numbers though the table's are, are dropouts; a row with too few columns
 //! or a broken header is an error that names the line.
 
+use super::axis::along_principal_axis;
 use super::trace::{SignalError, Trace, quantile};
-use nalgebra::DMatrix;
 
 /// Which columns to read, where the table itself does not say.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -78,7 +78,8 @@ impl Trace {
             }
             let number = |c: usize| separator.number(cells[c]);
             let row: Vec<f64> = values.iter().map(|&c| number(c)).collect();
-            // a lone zero may be a value; a zero time beside it, or zeros in every column, is a sensor that saw nothing
+            // a lone zero may be a value; a zero time beside it, or zeros in every column, is a sensor that saw nothing. Where a recording begins, it may
+            // be the place that all is measured from: whether it is, the other rows say (`super::axis`)
             let nothing = row.iter().all(|v| *v == 0.0) && (row.len() > 1 || number(time) == 0.0) && !rows.is_empty();
             if nothing || row.iter().any(|v| !v.is_finite()) || !number(time).is_finite() {
                 dropped += 1;
@@ -90,9 +91,10 @@ impl Trace {
             return Err(SignalError::file(name, format!("none of {dropped} rows is a sample")));
         }
         let unit = options.time_unit_s.unwrap_or_else(|| guess_unit(&header[time], &rows));
-        let signal = along_principal_axis(&rows);
-        let mut trace = Self::new(name, rows.iter().zip(signal).map(|((t, _), v)| (t * unit, v)))?;
-        trace.dropped_rows += dropped;
+        let along = along_principal_axis(rows);
+        let mut trace = Self::new(name, along.rows.into_iter().map(|(t, v)| (t * unit, v)))?;
+        trace.dropped_rows += dropped + along.zeros;
+        trace.outlier_rows += along.spikes;
         Ok(trace)
     }
 }
@@ -103,24 +105,6 @@ fn guess_unit(header: &str, rows: &[(f64, Vec<f64>)]) -> f64 {
     }
     let step = quantile(rows.windows(2).map(|w| w[1].0 - w[0].0).collect(), 0.5);
     if step >= 2.0 && !header.contains("(s)") { 1e-3 } else { 1.0 }
-}
-
-/// The samples along the direction in which they vary most, about their mean.
-fn along_principal_axis(rows: &[(f64, Vec<f64>)]) -> Vec<f64> {
-    let width = rows[0].1.len();
-    if width == 1 {
-        return rows.iter().map(|(_, v)| v[0]).collect();
-    }
-    let mean: Vec<f64> = (0..width).map(|c| rows.iter().map(|(_, v)| v[c]).sum::<f64>() / rows.len() as f64).collect();
-    let covariance = DMatrix::from_fn(width, width, |a, b| {
-        rows.iter().map(|(_, v)| (v[a] - mean[a]) * (v[b] - mean[b])).sum::<f64>() / rows.len() as f64
-    });
-    let eigen = covariance.symmetric_eigen();
-    let axis = eigen.eigenvectors.column(eigen.eigenvalues.imax());
-    let signal: Vec<f64> = rows.iter().map(|(_, v)| (0..width).map(|c| (v[c] - mean[c]) * axis[c]).sum()).collect();
-    let (low, middle, high) = (quantile(signal.clone(), 0.05), quantile(signal.clone(), 0.5), quantile(signal.clone(), 0.95));
-    let sign = if middle - low <= high - middle { 1.0 } else { -1.0 };
-    signal.into_iter().map(|v| sign * v).collect()
 }
 
 #[derive(Clone, Copy)]

@@ -4,6 +4,7 @@
 //! [`Synthetic`] draws breaths that vary as those of a recording; [`Live`] follows a slider or holds another signal's breath.
 //! Files are read by whoever calls: parsers take the text and the name that errors should show.
 
+mod axis;
 mod csv;
 mod cycles;
 mod filter;

@@ -50,6 +50,10 @@ pub struct RecordedReport {
     pub gaps: usize,
     /// the longest of them [s]
     pub longest_gap_s: f64,
+    /// gaps that were closed up, since no breath can be told in them: leaps of the clock
+    pub leaps: usize,
+    /// the longest of them, as it was in the file [s]
+    pub longest_leap_s: f64,
     /// rows of the file that were no measurement, or out of reach
     pub rows_left_out: usize,
     /// how late the filter is [s]
@@ -63,6 +67,11 @@ impl fmt::Display for RecordedReport {
             0 => write!(f, "no gaps")?,
             1 => write!(f, "one gap of {:.1} s", self.longest_gap_s)?,
             n => write!(f, "{n} gaps, the longest {:.1} s", self.longest_gap_s)?,
+        }
+        match self.leaps {
+            0 => {}
+            1 => write!(f, ", one leap of the clock by {:.1} s, closed up", self.longest_leap_s)?,
+            n => write!(f, ", {n} leaps of the clock by up to {:.1} s, closed up", self.longest_leap_s)?,
         }
         let (left_out, all) = (self.rows_left_out, self.rows + self.rows_left_out);
         write!(f, ", {left_out} of {all} rows left out; {:.2} s late by its filter, repeats after {:.0} s", self.delay_s, self.loop_s)
@@ -142,6 +151,8 @@ impl Recorded {
             rows: trace.values.len(),
             gaps: gaps.len(),
             longest_gap_s: gaps.iter().map(|g| g.1).fold(0.0, f64::max),
+            leaps: trace.leaps_s.len(),
+            longest_leap_s: trace.leaps_s.iter().fold(0.0, |longest, &leap| leap.max(longest)),
             rows_left_out: trace.dropped_rows + trace.outlier_rows,
             delay_s: filter.delay_s(),
         };

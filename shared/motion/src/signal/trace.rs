@@ -5,6 +5,10 @@
 //! the time between them, and the quartiles of the recording by `REACH` times their distance. So a spike, or a sensor that falls far off
 //! and comes back, is a gap.
 //!
+//! A gap longer than [`LONGEST_GAP_S`] is a leap: a clock that was set, or a sensor that was away for breaths. It is closed up, and told: what is
+//! left of it is the time in which the signal at its usual highest speed gets from one side to the other, so that nobody waits motionless
+//! and nothing jumps. So n rows last at most n · [`LONGEST_GAP_S`], and no stamp of a clock makes a recording long.
+//!
 //! Units: seconds from the first good sample; values in the file's unit (mm for markers and RPM).
 //! Not here: what fills the gaps (`super::recorded`).
 
@@ -57,12 +61,21 @@ pub struct Trace {
     pub outlier_rows: usize,
     /// rows that the recorder itself marked as irregular breathing (kept)
     pub irregular_rows: usize,
+    /// lengths of the gaps that were closed up [s]
+    pub leaps_s: Vec<f64>,
 }
+
+/// A gap longer than this is closed up [s]: longer than a breath, so that nothing could be said of what was in it.
+pub const LONGEST_GAP_S: f64 = 10.0;
+/// Samples that lie further apart than this in the median show no breathing [s]: two of them a breath of 10 s.
+const FARTHEST_S: f64 = 5.0;
+/// The longest recording that is played [s]; at 100 samples a second it takes some 300 MiB to prepare.
+const LONGEST_S: f64 = 24.0 * 3600.0;
 
 /// How many times the usual highest speed a marker may move before it is an outlier.
 const JUMP: f64 = 6.0;
 /// How many times the distance of the quartiles a value may lie beyond them.
-const REACH: f64 = 3.0;
+pub(super) const REACH: f64 = 3.0;
 /// A recording shorter than this many good samples says nothing of breathing.
 const FEWEST: usize = 16;
 
@@ -91,7 +104,15 @@ impl Trace {
     /// # Errors
     /// One sentence when too little is left.
     pub fn new(name: &str, rows: impl IntoIterator<Item = (f64, f64)>) -> Result<Self, SignalError> {
-        let mut trace = Self { name: name.into(), times_s: vec![], values: vec![], dropped_rows: 0, outlier_rows: 0, irregular_rows: 0 };
+        let mut trace = Self {
+            name: name.into(),
+            times_s: vec![],
+            values: vec![],
+            dropped_rows: 0,
+            outlier_rows: 0,
+            irregular_rows: 0,
+            leaps_s: vec![],
+        };
         let mut finite: Vec<(f64, f64)> = Vec::new();
         for (time, value) in rows {
             if time.is_finite() && value.is_finite() {
@@ -109,8 +130,18 @@ impl Trace {
                 format!("{} usable samples ({} rows dropped); at least {FEWEST} are needed", trace.times_s.len(), trace.dropped_rows);
             return Err(SignalError::file(name, fault));
         }
-        let first = trace.times_s[0];
-        trace.times_s.iter_mut().for_each(|t| *t -= first);
+        let apart = trace.period_s();
+        if apart > FARTHEST_S {
+            let fault =
+                format!("half of its samples are {apart:.1} s and more apart, which shows no breathing; is the unit of its times another?");
+            return Err(SignalError::file(name, fault));
+        }
+        trace.close_up();
+        let lasts = trace.duration_s();
+        if lasts > LONGEST_S {
+            let fault = format!("it lasts {:.0} hours; at most {:.0} can be played, so cut it", lasts / 3600.0, LONGEST_S / 3600.0);
+            return Err(SignalError::file(name, fault));
+        }
         Ok(trace)
     }
 
@@ -138,14 +169,37 @@ impl Trace {
         self.times_s.windows(2).filter(|w| w[1] - w[0] > longest_s).map(|w| (w[0], w[1] - w[0])).collect()
     }
 
+    /// Speed that the recording keeps below for nine tenths of its steps [unit/s]; 0 where it hardly ever moves.
+    fn usual_speed(&self) -> f64 {
+        let steps = self.times_s.windows(2).zip(self.values.windows(2));
+        quantile(steps.map(|(t, v)| (v[1] - v[0]).abs() / (t[1] - t[0])).collect(), 0.9)
+    }
+
+    /// Makes times begin at 0 and leaps as short as they can be without a jump of the signal.
+    fn close_up(&mut self) {
+        let (usual, speed) = (self.period_s(), self.usual_speed());
+        let (mut now, mut last) = (0.0, self.times_s[0]);
+        for n in 0..self.times_s.len() {
+            let gap = self.times_s[n] - last;
+            last = self.times_s[n];
+            now += if gap > LONGEST_GAP_S {
+                self.leaps_s.push(gap);
+                // not a number where nothing moves: max and min then take the other
+                ((self.values[n] - self.values[n - 1]).abs() / speed).max(usual).min(LONGEST_GAP_S)
+            } else {
+                gap
+            };
+            self.times_s[n] = now;
+        }
+    }
+
     fn drop_outliers(&mut self) {
-        let speeds: Vec<f64> =
-            self.times_s.windows(2).zip(self.values.windows(2)).map(|(t, v)| (v[1] - v[0]).abs() / (t[1] - t[0])).collect();
+        let speed = self.usual_speed();
         let (low, high) = (quantile(self.values.clone(), 0.25), quantile(self.values.clone(), 0.75));
         let beyond = REACH * (high - low);
         let (low, high) = (low - beyond, high + beyond);
         // a quantised or still signal has speed 0 at most samples: then its range a second is what it may do
-        let fastest = JUMP * quantile(speeds, 0.9).max(beyond / REACH);
+        let fastest = JUMP * speed.max(beyond / REACH);
         let mut last: Option<(f64, f64)> = None;
         let kept: Vec<bool> = (0..self.times_s.len())
             .map(|n| {
@@ -207,6 +261,43 @@ mod tests {
         }
         let again = (0..400).map(|n| (f64::from(if n < 250 { n } else { n - 250 }) * 0.1, wave(f64::from(n) * 0.1)));
         assert_eq!(Trace::new("again", again).unwrap().dropped_rows, 150);
+    }
+
+    /// A clock not yet set at the first row, set on in the middle or at the last row: nothing of breathing is lost, and no time is added.
+    #[test]
+    fn a_leap_of_the_clock_is_closed_up_and_told() {
+        for (from, by) in [(1, 1.6e9), (1, 4e4), (240, 3600.0), (399, 99_999.9), (200, 1e300)] {
+            let rows = (0..400).map(|n| (f64::from(n) * 0.1 + if n < from { 0.0 } else { by }, wave(f64::from(n) * 0.1)));
+            let trace = Trace::new("leap", rows);
+            if by > 1e200 {
+                // what is left of it is no clock: the rows after the leap all have one time
+                assert_eq!(trace.unwrap().times_s.len(), 201);
+                continue;
+            }
+            let trace = trace.unwrap();
+            assert_eq!((trace.times_s.len(), trace.leaps_s.len(), trace.gaps(1.0).len()), (400, 1, 0), "{from} {by}");
+            assert!((trace.leaps_s[0] - by - 0.1).abs() < 1e-6 * by, "{:?}", trace.leaps_s);
+            // as long as without the leap, up to the rounding of a clock that counts from 1970
+            assert!((trace.duration_s() - 39.9).abs() < 0.15, "{}", trace.duration_s());
+        }
+        // a sensor that was away for a minute and comes back elsewhere in the breath: a bridge no steeper than breathing
+        let away = (0..1000).filter(|n| !(310..910).contains(n)).map(|n| (f64::from(n) * 0.1, wave(f64::from(n) * 0.1)));
+        let trace = Trace::new("away", away).unwrap();
+        let steepest = |trace: &Trace| {
+            let steps = trace.times_s.windows(2).zip(trace.values.windows(2));
+            steps.map(|(t, v)| (v[1] - v[0]).abs() / (t[1] - t[0])).fold(0.0, f64::max)
+        };
+        assert!(trace.leaps_s.len() == 1 && trace.duration_s() < 43.0 && steepest(&trace) < 6.05, "{}", trace.duration_s());
+    }
+
+    #[test]
+    fn what_is_no_recording_of_breathing_is_refused_and_not_laid_out() {
+        let says = |step: f64, what: &str| {
+            let fault = Trace::new("r", (0..50_000).map(|n| (f64::from(n) * step, wave(f64::from(n))))).unwrap_err().to_string();
+            assert!(fault.starts_with("r: ") && fault.contains(what), "{fault}");
+        };
+        says(3600.0, "half of its samples are 3600.0 s and more apart");
+        says(4.0, "it lasts 56 hours");
     }
 
     #[test]
