@@ -151,6 +151,45 @@ fn a_scene_renders_with_its_own_patient_and_camera() {
 }
 
 #[test]
+fn a_scene_renders_with_its_organs_one_of_them_alone_and_its_meshes() {
+    let folder = Folder::new("organs");
+    write_nrrd(&folder.path("v.nrrd"), |x| {
+        let [a, b] = [ball(x, [-12.0, 0.0, 0.0], 10.0), ball(x, [14.0, 0.0, 0.0], 8.0)];
+        a.max(b).clamp(-1000.0, 1000.0)
+    });
+    let drawn = |name: &str, alone: &str, rows: &str, view: &[&str]| {
+        let scene = folder.path(&format!("{name}.toml"));
+        let head = "[volume]\nfile = \"v.nrrd\"\n[rendering]\nsize = [96, 64]\nsection_size = [64, 64]\nfrom = [0.0, -1.0, 0.0]\n";
+        fs::write(&scene, format!("{head}{alone}{rows}")).unwrap();
+        picture(&scene, &folder.path(&format!("{name}.png")), view).2
+    };
+    let organ = "[[organ]]\nname = \"left\"\nhu = [[0.0, 3000.0]]\nseed_mm = [14.0, 0.0, 0.0]\n";
+    let mesh = "[[mesh]]\norgan = \"left\"\ncolor = [0.0, 1.0, 0.0]\n";
+    // pixels that are not background, in each half: seen from the front the patient's left is at the right
+    let halves = |rgb: &[u8]| {
+        let mut seen = [0; 2];
+        for (n, p) in rgb.chunks(3).enumerate() {
+            seen[usize::from(n % 96 >= 48)] += usize::from(p.iter().zip(&rgb[..3]).any(|(a, b)| a.abs_diff(*b) > 2));
+        }
+        seen
+    };
+    let green = |rgb: &[u8]| rgb.chunks(3).filter(|p| p[1] > 60 && p[0] < 20 && p[2] < 20).count();
+    let bare = drawn("bare", "", "", &[]);
+    let alone = drawn("alone", "alone = \"left\"\n", organ, &[]);
+    let meshed = drawn("mesh", "", &format!("{organ}{mesh}"), &[]);
+    let ([right, left], [hidden, shown]) = (halves(&bare), halves(&alone));
+    assert!(right > 100 && left > 100 && hidden == 0 && 10 * shown > 8 * left, "{right} {left} {hidden} {shown}");
+    assert!(green(&bare) == 0 && green(&meshed) > left / 3, "{} of {left}", green(&meshed));
+    // sections: coloured, and outlined
+    let axial = ["--view", "axial"];
+    let grey = |rgb: &[u8]| rgb.chunks(3).filter(|p| p[0] == p[1] && p[1] == p[2]).count();
+    let [bare, labelled, outlined] = [("bare", "".into()), ("labels", organ.to_owned()), ("mesh", format!("{organ}{mesh}"))]
+        .map(|(name, rows)| drawn(name, "", &rows, &axial));
+    assert!(grey(&bare) == 64 * 64 && grey(&labelled) + 100 < grey(&bare), "{}", grey(&labelled));
+    assert!(green(&outlined) > 20 && green(&labelled) < green(&outlined));
+}
+
+#[test]
 fn what_cannot_be_done_is_one_sentence_and_status_1() {
     let folder = Folder::new("refused");
     let (out, text) = (folder.path("out.png"), folder.path("text.nrrd"));

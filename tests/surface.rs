@@ -117,7 +117,10 @@ fn what_cannot_be_is_refused_with_a_sentence() {
     let folder = Folder::new("refused");
     let [volume, mesh] = ["v.nrrd", "m.ply"].map(|n| folder.path(n));
     two_balls(&volume);
-    let cases: [(&[&str], i32, &str); 8] = [
+    let cases: [(&[&str], i32, &str); 11] = [
+        (&["--iso", "100", "--islands", "1e9", "-o", &mesh], 1, "all 2 parts of that tissue are smaller"),
+        (&["--range", "5000:6000", "--labels", &mesh], 1, "choose a value between"),
+        (&["--iso", "100", "--triangles", "0", "-o", &mesh], 2, "above 0"),
         (&["--iso", "5000", "-o", &mesh], 1, "choose a value between"),
         (&["--iso", "100", "-o", "mesh.vrml"], 2, "format is not known"),
         (&["--range=100:", "--seed", "-12,20,0", "-o", &mesh], 1, "choose another seed"),

@@ -2,12 +2,14 @@
 
 use super::{Failure, Outcome, invert::read_field};
 use clap::{Args as ClapArgs, ValueEnum};
+use maille_motion::resample::sample;
 use maille_phantom::{Kind, Phantom};
 use maille_raycast::{
     Camera, Extras, Geometry, Labels, Light, MeshView, Motion, Overlay, Picture, Plane, Preset, Probe, Section, Settings, Shown, Skip,
     SlabMode, Step, Transfer, Ultrasound, Warp, WarpOptions, overlay_section, overlay_view, render_extra, section_with, ultrasound,
 };
 use maille_raycast_gpu::{Choice, Gpu, GpuError, Renderer};
+use maille_rendering::Meshes;
 use maille_scene::{BoxMm, Mode as SceneMode, PhantomKind, Scene, VolumeSource};
 use maille_surface::{Mesh, read_mesh};
 use maille_volume::{BrickSource as _, BrickedVolume, Sampler, Volume, io};
@@ -97,10 +99,10 @@ struct More {
     /// barrel distortion of the lens, 0 for none; 0.3 is much
     #[arg(long, value_name = "K", value_parser = positive)]
     barrel: Option<f64>,
-    /// organs on the volume's own grid, in colours: a volume of whole numbers from 0 (nothing) to 255
+    /// organs on the volume's own grid, in colours: a volume of whole numbers from 0 (nothing) to 255 [default: the scene's]
     #[arg(long, value_name = "VOLUME")]
     labels: Option<PathBuf>,
-    /// a mesh among the voxels, in section views its outline: .stl, .ply or .obj, LPS millimetres; may be given several times
+    /// a mesh among the voxels, in section views its outline: .stl, .ply or .obj, LPS millimetres; may be given several times; beside the scene's
     #[arg(long, value_name = "MESH")]
     mesh: Vec<PathBuf>,
     /// a displacement field, rest → moved in mm, as `maille deform` and `maille motion eval` write it: show the patient as moved by it
@@ -169,6 +171,30 @@ pub fn run(args: &Args) -> Outcome {
     let (volume, scene) = load(&args.input)?;
     let mut bricks = BrickedVolume::from_volume(&volume);
     drop(volume);
+    // what a scene says is found in the patient at rest
+    let failed = |e: maille_rendering::RenderingError| Failure::Refused(format!("{}: {e}", args.input.display()));
+    let mut organs = None;
+    let mut of_scene = Meshes::default();
+    // as in a run: a radiograph shows neither, a fan neither
+    if let Some(scene) = scene.as_ref().filter(|_| !matches!(args.view, View::Xray | View::Ultrasound)) {
+        if args.more.labels.is_none() {
+            organs = maille_rendering::organs(scene, &bricks).map_err(failed)?;
+        }
+        of_scene = Meshes::of(scene, &bricks).map_err(failed)?;
+        if scene.organ_alone() > 0 && args.iso.is_some() && args.view == View::ThreeD {
+            eprintln!("maille: {}: a surface at one value has no organs, all of it is shown", args.input.display());
+        }
+    }
+    if organs.is_some() && args.more.warp.is_some() && args.more.warp_scheme == WarpScheme::Resample {
+        return Err(Failure::Refused("a resampled patient has no organs: leave `--warp-scheme resample` out, or render the volume".into()));
+    }
+    if let Some(path) = args.more.warp.as_deref().filter(|_| !of_scene.is_empty()) {
+        let field = read_field(path)?;
+        of_scene.carry(|p| {
+            let by = sample(&field, field.grid.index_from_world(p));
+            std::array::from_fn(|c| p[c] + f64::from(by[c]))
+        });
+    }
     // colours are those of the patient at rest, also where that patient is resampled
     let moved = args.more.warp.as_deref().map(|path| warp(path, &bricks, args.more.warp_tolerance)).transpose()?;
     if let (Some(inverse), WarpScheme::Resample) = (&moved, args.more.warp_scheme) {
@@ -189,9 +215,12 @@ pub fn run(args: &Args) -> Outcome {
     // where a 3D view is coloured it must be known how far away things are
     let depth = shown.is_some() && plane.is_none();
     let mut picture = if depth { Picture::with_depth(width, height) } else { Picture::new(width, height) };
-    let labels = args.more.labels.as_deref().map(|path| labels(path, &bricks)).transpose()?;
+    let of_file = args.more.labels.as_deref().map(|path| labels(path, &bricks)).transpose()?;
+    let alone = scene.as_ref().map_or(0, Scene::organ_alone) as usize;
+    let labels = of_file.as_ref().or(organs.as_mut().map(|organs| organs.show(alone)));
     let meshes = args.more.mesh.iter().map(|path| mesh(path)).collect::<Result<Vec<_>, _>>()?;
-    let views: Vec<MeshView<'_>> = meshes.iter().zip(MESH_COLORS.into_iter().cycle()).map(|(m, color)| mesh_view(m, color)).collect();
+    let mut views = of_scene.views();
+    views.extend(meshes.iter().zip(MESH_COLORS.into_iter().cycle()).map(|(m, color)| mesh_view(m, color)));
     let geometry = Geometry { capsules: &[], meshes: &views };
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(args.threads.unwrap_or(0))
@@ -206,7 +235,7 @@ pub fn run(args: &Args) -> Outcome {
     let times = match plane {
         Some(plane) => {
             let section_of = section_settings(args, scene.as_ref(), &bricks, plane, [width, height]);
-            let overlay = Overlay { warp, labels: labels.as_ref(), geometry: Some(&geometry), ..Overlay::default() };
+            let overlay = Overlay { warp, labels, geometry: Some(&geometry), ..Overlay::default() };
             let mut outcome = Ok(());
             let times = timed(frames, || match &mut gpu {
                 None => pool.install(|| section_with(&bricks, &section_of, &overlay, &mut picture)),
@@ -242,7 +271,7 @@ pub fn run(args: &Args) -> Outcome {
             if args.more.smooth && gpu.is_some() {
                 return Err(Failure::Refused("--smooth is drawn by the processor: leave `--backend gpu` out".into()));
             }
-            let extras = Extras { warp, labels: labels.as_ref(), barrel, geometry: Some(&geometry), zoom, ..Extras::default() };
+            let extras = Extras { warp, labels, barrel, geometry: Some(&geometry), zoom, ..Extras::default() };
             let mut outcome = Ok(());
             let times = timed(frames, || {
                 let drawn = match &mut gpu {

@@ -65,8 +65,8 @@ pub struct Args {
     /// Take the surface from an octree of tri-cubics, each leaf within this RMS of its voxels, instead of the voxels
     #[arg(long, value_name = "HU", value_parser = not_negative)]
     tolerance: Option<f64>,
-    /// Thin the mesh to about this many triangles
-    #[arg(long, value_name = "COUNT")]
+    /// Thin the mesh to about this many triangles; where the simplest forms of all its parts are more, the smallest parts are left out, and counted
+    #[arg(long, value_name = "COUNT", value_parser = count)]
     triangles: Option<usize>,
     /// Print one JSON object
     #[arg(long)]
@@ -110,6 +110,16 @@ pub fn run(args: &Args) -> Outcome {
     let wants_organ = is_part || args.labels.is_some() || args.alone.is_some();
     let found = wants_organ.then(|| find(args, &source, &ranges)).transpose()?;
     let [low, high] = ends(&volume);
+    if let Some(found) = found.as_ref().filter(|found| found.voxels == 0) {
+        return Err(Failure::Refused(match (found.left_out, args.islands) {
+            (parts @ 1.., Some(islands)) => {
+                format!("{}: all {parts} parts of that tissue are smaller than --islands {islands} mm³", args.volume.display())
+            }
+            _ => {
+                format!("{} has nothing of that value: its values run from {low} to {high}; choose a value between", args.volume.display())
+            }
+        }));
+    }
     if let Some(found) = &found {
         let mm3 = volume.info.grid.spacing.iter().product::<f64>() * found.voxels as f64;
         said.push(format!("{} voxels, {mm3:.0} mm³, {} parts, {} left out", found.voxels, found.parts, found.left_out));
@@ -144,7 +154,12 @@ pub fn run(args: &Args) -> Outcome {
             )));
         }
         if let Some(triangles) = args.triangles {
-            mesh = decimate(&mesh, triangles).map_err(|error| Failure::Refused(error.to_string()))?;
+            let thinned = decimate(&mesh, triangles).map_err(|error| Failure::Refused(error.to_string()))?;
+            if thinned.parts_left_out > 0 {
+                said.push(format!("{} small parts left out: {triangles} triangles have no room for them", thinned.parts_left_out));
+                report.insert("parts_left_out".into(), thinned.parts_left_out.into());
+            }
+            mesh = thinned.mesh;
         }
         save(&mesh, output, write)?;
         said.push(format!("{}: {} vertices, {} triangles", output.display(), mesh.positions.len(), mesh.triangles.len()));
@@ -252,6 +267,10 @@ fn finite(text: &str) -> Result<f64, String> {
 
 fn positive(text: &str) -> Result<f64, String> {
     finite(text).ok().filter(|v| *v > 0.0).ok_or_else(|| format!("{text} is not a number above 0"))
+}
+
+fn count(text: &str) -> Result<usize, String> {
+    text.trim().parse().ok().filter(|n| *n > 0).ok_or_else(|| format!("{text} is not a whole number of triangles above 0"))
 }
 
 fn not_negative(text: &str) -> Result<f64, String> {

@@ -28,6 +28,9 @@ mod view;
 #[cfg(test)]
 mod wakes;
 
+pub use meshes::Meshes;
+pub use organs::{Organs, organs};
+
 use maille_contract::needle::{NeedleLog, NeedleState};
 use maille_contract::{FrameHeader, Role, ServiceCell, Switches, ToolState, control::Counter};
 use maille_raycast::FrameBudget;

@@ -17,7 +17,7 @@ const COLORS: [[f32; 3]; 6] =
 
 /// The meshes of a scene.
 #[derive(Default)]
-pub(crate) struct Meshes {
+pub struct Meshes {
     all: Vec<Carried>,
 }
 
@@ -31,6 +31,9 @@ struct Carried {
 
 impl Meshes {
     /// Of a scene, in a volume at rest.
+    ///
+    /// # Errors
+    /// When a mesh cannot be read, has no triangles, or is of an organ that is not there.
     pub fn of(scene: &Scene, rest: &impl BrickSource) -> Result<Self, RenderingError> {
         let mut all = Vec::with_capacity(scene.meshes.len());
         for (n, said) in scene.meshes.iter().enumerate() {
@@ -42,7 +45,7 @@ impl Meshes {
                 (None, None) => continue,
             };
             if let Some(triangles) = said.triangles {
-                mesh = decimate(&mesh, triangles).map_err(|e| fault(e.to_string()))?;
+                mesh = decimate(&mesh, triangles).map_err(|e| fault(e.to_string()))?.mesh;
             }
             if mesh.triangles.is_empty() {
                 return Err(fault("it has no triangles".into()));

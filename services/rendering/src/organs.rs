@@ -1,4 +1,4 @@
-//! The scene's organs: labels of the patient at rest, found once at the start, held by this process alone.
+//! The scene's organs: labels of the patient at rest, found once at the start, held by the process that draws alone.
 //!
 //! `maille-surface` finds them; here is what a scene says of them. An organ that comes later in the scene takes what two have. One byte a voxel, only in a scene
 //! that has organs.
@@ -10,7 +10,7 @@ use maille_surface::{Organ, Selection, organ};
 use maille_volume::BrickSource;
 
 /// The scene's organs, one of which may be shown alone: then everything else lets light through.
-pub(crate) struct Organs {
+pub struct Organs {
     labels: Labels,
     colors: [[f32; 4]; 256],
     count: usize,
@@ -18,7 +18,10 @@ pub(crate) struct Organs {
 }
 
 /// Labels of the scene's organs, numbered from 1; `None` in a scene without.
-pub(crate) fn organs(scene: &Scene, rest: &impl BrickSource) -> Result<Option<Organs>, RenderingError> {
+///
+/// # Errors
+/// When an organ is not there, by its name.
+pub fn organs(scene: &Scene, rest: &impl BrickSource) -> Result<Option<Organs>, RenderingError> {
     if scene.organs.is_empty() {
         return Ok(None);
     }

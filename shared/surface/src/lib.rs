@@ -19,7 +19,7 @@ mod table;
 mod vif;
 mod write;
 
-pub use decimate::{DecimateError, decimate};
+pub use decimate::{DecimateError, Thinned, decimate};
 pub use gltf::write_glb;
 pub use marching_cubes::{Border, marching_cubes, marching_cubes_bricks, marching_cubes_with};
 pub use mesh::Mesh;

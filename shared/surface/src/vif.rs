@@ -1,10 +1,10 @@
 //! Marching cubes on the volumetric implicit function, at any resolution.
 //!
 //! The continuous layer ([`maille_vif::Spline`]) of a volume or of an octree is sampled on a lattice `per_voxel` times as fine as the voxels
-//! (or coarser, below 1), in bricks, and only in those that the surface may pass: a spline stays among its coefficients, and these
-//! within a known multiple of their voxels' range, so that elsewhere skip cells are all that is looked at. Marching cubes then runs on
-//! the bricks as on any volume's. At last every vertex is put where the function itself crosses its lattice edge, not its samples, and
-//! takes its normal from the function's gradient.
+//! (or coarser, below 1; rounded up along each axis, so that the outermost points are the outermost voxel centres), in bricks, and only in those that
+//! the surface may pass: a spline stays among its coefficients, and these within a known multiple of their voxels' range, so that elsewhere skip cells are
+//! all that is looked at. Marching cubes then runs on the bricks as on any volume's. At last every vertex is put where the function itself crosses its lattice
+//! edge, not its samples, and takes its normal from the function's gradient; a closed surface closes half a voxel beyond the outermost centres at any resolution.
 //!
 //! **On patches** ([`marching_cubes_patches`]) every vertex then goes on to the least-squares bi-cubic patch around it [Shimizu & Nakamura, eq. 6 and 7], on a
 //! spline that smooths little itself. Noise is averaged along the surface, over 25 crossings, and not across it: a window that takes as much
@@ -103,11 +103,14 @@ fn extract(
         return Ok(Mesh::default());
     }
     let coarse = &lattice.info().grid;
-    let size = coarse.size.map(|n| ((n - 1) as f64 * per_voxel + 1e-9) as usize + 1);
+    let size = coarse.size.map(|n| ((n - 1) as f64 * per_voxel - 1e-9).ceil() as usize + 1);
     if let Some(&points) = size.iter().find(|n| **n > LONGEST) {
         return Err(ResolutionError::Points { points });
     }
-    let grid = Grid { size, spacing: coarse.spacing.map(|s| s / per_voxel), ..coarse.clone() };
+    // a little finer than asked along axes whose last point would not be the last centre
+    let per_voxel: [f64; 3] =
+        std::array::from_fn(|c| if size[c] > 1 { (size[c] - 1) as f64 / (coarse.size[c] - 1) as f64 } else { per_voxel });
+    let grid = Grid { size, spacing: std::array::from_fn(|c| coarse.spacing[c] / per_voxel[c]), ..coarse.clone() };
     let samples = Samples::new(lattice, window, iso, per_voxel, grid);
     let mut mesh = marching_cubes_bricks(&samples, iso, border);
     samples.settle(lattice, window, iso, per_voxel, finish, &mut mesh);
@@ -147,7 +150,7 @@ enum Side {
 }
 
 impl Samples {
-    fn new(lattice: &(impl Lattice + ?Sized), window: Window, iso: f64, per_voxel: f64, grid: Grid) -> Self {
+    fn new(lattice: &(impl Lattice + ?Sized), window: Window, iso: f64, per_voxel: [f64; 3], grid: Grid) -> Self {
         let layout = BrickLayout::new(grid.size);
         // the isovalue is stored as 0
         let rescale = Rescale { slope: lattice.info().rescale.slope.abs() * FINER, intercept: iso };
@@ -181,13 +184,14 @@ impl Samples {
     }
 
     /// Puts every vertex where the function crosses its lattice edge, or on the patch around that place, and gives it its normal.
-    fn settle(&self, lattice: &(impl Lattice + ?Sized), window: Window, iso: f64, per_voxel: f64, finish: Finish, mesh: &mut Mesh) {
+    fn settle(&self, lattice: &(impl Lattice + ?Sized), window: Window, iso: f64, per_voxel: [f64; 3], finish: Finish, mesh: &mut Mesh) {
         let grid = &self.info.grid;
         let (to_index, to_world) = (grid.index_from_world_matrix(), grid.world_from_index_matrix());
         let origin = Vector3::from(grid.origin);
         let index = |p: &[f32; 3]| to_index * (Vector3::from(p.map(f64::from)) - origin);
         let size = grid.size;
-        // vertices by brick; those beyond the border, of a closed surface, stay
+        let fine = Vector3::from(per_voxel);
+        // vertices by brick
         let brick_of = |p: &[f32; 3]| -> Option<BrickId> {
             let at = index(p);
             let inside = (0..3).all(|c| at[c] > -0.25 && at[c] < size[c] as f64 - 0.75);
@@ -195,9 +199,22 @@ impl Samples {
             inside.then(|| self.layout.brick_of(cell(0), cell(1), cell(2)))
         };
         let mut of_brick = vec![Vec::new(); self.slot.len()];
-        for (n, p) in mesh.positions.iter().enumerate() {
-            if let Some(id) = brick_of(p) {
-                of_brick[id as usize].push(n as u32);
+        for (n, p) in mesh.positions.iter_mut().enumerate() {
+            match brick_of(p) {
+                Some(id) => of_brick[id as usize].push(n as u32),
+                // beyond the border, of a closed surface: half a voxel, not half a step of the lattice
+                None => {
+                    let mut at = index(p);
+                    for c in 0..3 {
+                        let last = size[c] as f64 - 1.0;
+                        if at[c] < -0.25 {
+                            at[c] = -0.5 * fine[c];
+                        } else if at[c] > last + 0.25 {
+                            at[c] = last + 0.5 * fine[c];
+                        }
+                    }
+                    *p = (to_world * at + origin).map(|v| v as f32).into();
+                }
             }
         }
         let coarse = &lattice.info().grid;
@@ -224,18 +241,18 @@ impl Samples {
                     let (low, high) = (at[axis].floor(), at[axis].floor() + 1.0);
                     let mut gradient = Vector3::zeros();
                     for _ in 0..3 {
-                        let Some((value, g)) = spline.sample((at / per_voxel).into()) else { return (*old, *normal) };
+                        let Some((value, g)) = spline.sample(at.component_div(&fine).into()) else { return (*old, *normal) };
                         gradient = g;
-                        let step = (iso - value) / g[axis] * per_voxel;
+                        let step = (iso - value) / g[axis] * fine[axis];
                         if between[axis] < 1e-4 || !step.is_finite() || step.abs() < 1e-6 {
                             break;
                         }
                         at[axis] = (at[axis] + step).clamp(low, high);
                     }
                     if finish == Finish::Patch
-                        && let Ok(patch) = LocalSurface::find(spline, coarse, iso, (at / per_voxel).into(), step_mm)
+                        && let Ok(patch) = LocalSurface::find(spline, coarse, iso, at.component_div(&fine).into(), step_mm)
                         && patch.found >= ENOUGH
-                        && (Vector3::from(patch.point) - at / per_voxel).amax() < FARTHEST
+                        && (Vector3::from(patch.point) - at.component_div(&fine)).amax() < FARTHEST
                     {
                         let point = coarse.world_from_index(patch.point);
                         return (point.map(|v| v as f32), patch.world_normal(coarse).map(|v| v as f32));
@@ -259,9 +276,11 @@ impl Samples {
 }
 
 /// The box of voxels whose coefficients a brick of samples is made from: first, and extent. `first` is that of its apron.
-fn voxels_of(per_voxel: f64, first: [isize; 3]) -> ([isize; 3], [usize; 3]) {
-    let low = first.map(|v| (v as f64 / per_voxel).floor() as isize - 1);
-    let high = first.map(|v| ((v + STORED_EDGE as isize - 1) as f64 / per_voxel).floor() as isize + 3);
+fn voxels_of(per_voxel: [f64; 3], first: [isize; 3]) -> ([isize; 3], [usize; 3]) {
+    let low: [isize; 3] = std::array::from_fn(|c| (first[c] as f64 / per_voxel[c]).floor() as isize - 1);
+    // a point on a voxel's centre may be rounded to either side of it
+    let last = |c: usize| (first[c] + STORED_EDGE as isize - 1) as f64 / per_voxel[c] + 1e-6;
+    let high: [isize; 3] = std::array::from_fn(|c| last(c).floor() as isize + 3);
     (low, std::array::from_fn(|c| (high[c] - low[c]) as usize))
 }
 
@@ -270,7 +289,7 @@ fn side(
     lattice: &(impl Lattice + ?Sized),
     window: Window,
     iso: f64,
-    per_voxel: f64,
+    per_voxel: [f64; 3],
     first: [isize; 3],
     rescale: Rescale,
     spline: &mut Spline,
@@ -303,7 +322,7 @@ fn side(
     if let Some(side) = of([a - margin, b + margin]) {
         return side;
     }
-    spline.refine(first.map(|v| v as f64 / per_voxel), per_voxel, [STORED_EDGE; 3], values);
+    spline.refine(std::array::from_fn(|c| first[c] as f64 / per_voxel[c]), per_voxel, [STORED_EDGE; 3], values);
     let mut brick: Box<Brick> = Box::new(bytemuck::Zeroable::zeroed());
     let (mut any, mut all) = (false, true);
     for (row, source) in values.chunks_exact(STORED_EDGE).enumerate() {

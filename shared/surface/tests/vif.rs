@@ -1,7 +1,8 @@
 //! Marching cubes on the continuous function: closed, of the right genus, nearer to the truth than the voxels' mesh, and glTF files.
 
 use maille_surface::{
-    Border, Mesh, PATCHES_PER_VOXEL, ResolutionError, decimate, marching_cubes, marching_cubes_patches, marching_cubes_vif, write_glb,
+    Border, Mesh, PATCHES_PER_VOXEL, ResolutionError, decimate, marching_cubes, marching_cubes_patches, marching_cubes_vif,
+    marching_cubes_with, write_glb,
 };
 use maille_testkit::{ScalarFunction, Sphere, Torus};
 use maille_vif::{Octree, Options, Tolerance, Voxels, Window};
@@ -213,7 +214,9 @@ fn a_thinned_mesh_stays_closed_and_near() {
         let bricks = BrickedVolume::from_volume(&volume);
         let mut mesh = marching_cubes_vif(&Voxels(&bricks), Window::One, 500.0, 1.0, Border::Open).unwrap();
         let wanted = mesh.triangles.len() / 5;
-        let mut thin = decimate(&mesh, wanted).unwrap();
+        let thinned = decimate(&mesh, wanted).unwrap();
+        assert_eq!(thinned.parts_left_out, 0);
+        let mut thin = thinned.mesh;
         assert_eq!(euler_of_closed(&thin), euler, "{name}");
         assert!(thin.triangles.len() <= wanted + 2 && thin.triangles.len() > wanted / 2);
         for m in [&mut mesh, &mut thin] {
@@ -223,7 +226,95 @@ fn a_thinned_mesh_stays_closed_and_near() {
         println!("{name}: {} to {} triangles, {distance:.3} mm and {angle:.1}° off", mesh.triangles.len(), thin.triangles.len());
         assert!(distance < 0.1 && angle < 8.0, "{name}: {distance} mm, {angle}°");
         assert!((thin.volume() / mesh.volume() - 1.0).abs() < 0.03);
-        assert_eq!(decimate(&thin, 1_000_000).unwrap(), thin);
+        assert_eq!(decimate(&thin, 1_000_000).unwrap().mesh, thin);
     }
-    assert_eq!(decimate(&Mesh::default(), 0).unwrap(), Mesh::default());
+    assert_eq!(decimate(&Mesh::default(), 0).unwrap().mesh, Mesh::default());
+}
+
+/// Noise: hundreds of small parts, of few triangles each, whose collapses leave triangles that fold onto each other.
+fn noise() -> Mesh {
+    let mut state = 11;
+    let voxels = (0..21 * 19 * 30).map(|_| (2000.0 * uniform(&mut state) - 1000.0) as i16).collect();
+    let volume = Volume::new(Grid::axis_aligned([21, 19, 30], [1.0; 3]), Rescale { slope: 1.0, intercept: 0.0 }, voxels);
+    marching_cubes_with(&volume, 700.0, Border::Closed)
+}
+
+#[test]
+fn a_thinned_mesh_has_unit_normals_also_where_triangles_fold_onto_each_other() {
+    let mesh = noise();
+    for part in [2, 4, 10, 100] {
+        let thin = decimate(&mesh, mesh.triangles.len() / part).unwrap().mesh;
+        assert_eq!(thin.normals.len(), thin.positions.len());
+        for n in &thin.normals {
+            let length = n.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            // what f32 rounds
+            assert!((length - 1.0).abs() < 1e-6, "one of {} triangles: {n:?}", mesh.triangles.len() / part);
+        }
+    }
+}
+
+#[test]
+fn where_there_is_no_room_for_all_parts_the_smallest_are_left_out_and_counted() {
+    let mesh = noise();
+    for wanted in [500, 100] {
+        let thinned = decimate(&mesh, wanted).unwrap();
+        assert!(thinned.mesh.triangles.len() <= wanted && thinned.parts_left_out > 0, "{} for {wanted}", thinned.mesh.triangles.len());
+        // what stays is closed, and of more area than as many triangles of all would be
+        euler_of_closed(&thinned.mesh);
+        assert!(thinned.mesh.triangles.iter().flatten().all(|&v| (v as usize) < thinned.mesh.positions.len()));
+        let each = |m: &Mesh| m.area() / m.triangles.len() as f64;
+        assert!(each(&thinned.mesh) > each(&mesh));
+    }
+    // the last part stays, whatever is asked for
+    let one = decimate(&mesh, 1).unwrap().mesh;
+    // two triangles back to back at the least
+    assert!((2..20).contains(&one.triangles.len()), "{}", one.triangles.len());
+    euler_of_closed(&one);
+}
+
+#[test]
+fn at_any_resolution_a_surface_ends_at_the_outermost_centres_and_closes_half_a_voxel_beyond() {
+    // a bar through all slices, and a block that fills the volume
+    let bar = |[i, j, _]: [usize; 3]| (5..12).contains(&i) && (4..11).contains(&j);
+    let grid = Grid { origin: [3.0, -8.0, 40.0], ..Grid::axis_aligned([17, 16, 14], [0.9, 1.0, 1.6]) };
+    let make = |inside: &dyn Fn([usize; 3]) -> bool, grid: &Grid| {
+        let [nx, ny, _] = grid.size;
+        let voxels = (0..grid.voxel_count()).map(|n| if inside([n % nx, n / nx % ny, n / (nx * ny)]) { 1000 } else { -1000 });
+        Volume::new(grid.clone(), Rescale { slope: 1.0, intercept: 0.0 }, voxels.collect())
+    };
+    let ends = |mesh: &Mesh, grid: &Grid| {
+        let along =
+            |pick: fn(f64, f64) -> f64, from| mesh.positions.iter().map(|p| grid.index_from_world(p.map(f64::from))[2]).fold(from, pick);
+        [along(f64::min, f64::INFINITY), along(f64::max, f64::NEG_INFINITY)]
+    };
+    let near = |a: f64, b: f64| (a - b).abs() < 1e-3;
+    let block_grid = Grid::axis_aligned([10; 3], [1.0; 3]);
+    let slab_grid = Grid::axis_aligned([10, 10, 1], [1.0; 3]);
+    let (bar, block, slab) = (make(&bar, &grid), make(&|_| true, &block_grid), make(&|_| true, &slab_grid));
+    let [truth, flat] = [&block, &slab].map(|v| marching_cubes_with(v, 0.0, Border::Closed).volume());
+    let bricks = [&bar, &block, &slab].map(BrickedVolume::from_volume);
+    for per_voxel in [0.3, 0.7, 1.0, 1.5, 2.0, 4.0] {
+        for patches in [false, true] {
+            let made = |bricks: &BrickedVolume, border| {
+                let lattice = Voxels(bricks);
+                let mesh = if patches {
+                    marching_cubes_patches(&lattice, 0.0, per_voxel, border)
+                } else {
+                    marching_cubes_vif(&lattice, Window::One, 0.0, per_voxel, border)
+                };
+                mesh.unwrap()
+            };
+            let [low, high] = ends(&made(&bricks[0], Border::Closed), &grid);
+            assert!(near(low, -0.5) && near(high, 13.5), "{per_voxel} a voxel, patches {patches}: closed from {low} to {high}");
+            let [low, high] = ends(&made(&bricks[0], Border::Open), &grid);
+            // a patch may take the last row of vertices a little along
+            let at = |a: f64, b: f64| (a - b).abs() < if patches { 0.1 } else { 1e-3 };
+            assert!(at(low, 0.0) && at(high, 13.0), "{per_voxel} a voxel, patches {patches}: open from {low} to {high}");
+            for (bricks, truth) in [(&bricks[1], truth), (&bricks[2], flat)] {
+                let closed = made(bricks, Border::Closed);
+                euler_of_closed(&closed);
+                assert!((closed.volume() / truth - 1.0).abs() < 1e-4, "{per_voxel} a voxel: {} for {truth} mm³", closed.volume());
+            }
+        }
+    }
 }

@@ -295,11 +295,11 @@ impl Spline {
     ///
     /// # Panics
     /// When a point has no value, or `out` does not hold them.
-    pub fn refine(&self, from: [f64; 3], per_voxel: f64, counts: [usize; 3], out: &mut Vec<f32>) {
+    pub fn refine(&self, from: [f64; 3], per_voxel: [f64; 3], counts: [usize; 3], out: &mut Vec<f32>) {
         let axis = |c: usize| -> Vec<(usize, [f32; 4])> {
             (0..counts[c])
                 .map(|n| {
-                    let x = from[c] + n as f64 / per_voxel - self.first[c] as f64;
+                    let x = from[c] + n as f64 / per_voxel[c] - self.first[c] as f64;
                     assert!(x >= 1.0 && x < self.extent[c] as f64 - 2.0, "the loaded box does not hold the finer lattice");
                     (x as usize - 1, weights((x - x.floor()) as f32))
                 })

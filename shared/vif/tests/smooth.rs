@@ -107,7 +107,7 @@ fn a_finer_lattice_holds_the_functions_values() {
     let mut spline = Spline::default();
     spline.load(&Voxels(&bricks), Window::Five, [2; 3], [12; 3]);
     let mut out = Vec::new();
-    spline.refine([4.25, 5.0, 3.5], 3.0, [13, 7, 9], &mut out);
+    spline.refine([4.25, 5.0, 3.5], [3.0; 3], [13, 7, 9], &mut out);
     for (n, v) in out.iter().enumerate() {
         let p = [n % 13, n / 13 % 7, n / 91].map(|v| v as f64 / 3.0);
         let truth = spline.value([4.25 + p[0], 5.0 + p[1], 3.5 + p[2]]).unwrap();
