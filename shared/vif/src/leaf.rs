@@ -15,6 +15,8 @@ use crate::{
 
 /// Part of the bound (as RMS) that rounding may use up.
 const SHARE: f64 = 0.25;
+/// Rounding of values that are summed up in f32, as a part of them: some units in the last place.
+const EVALUATION: f64 = 1.0 / (1 << 22) as f64;
 /// Most bits a voxel that packing takes before the voxels are kept as they are.
 const MOST_BITS: u32 = 12;
 
@@ -81,6 +83,9 @@ pub(crate) fn encode_cubic(fit: &Fit, bound: f64, out: &mut Vec<u8>) -> Option<(
         out.extend_from_slice(&mean.to_le_bytes());
         return Some((Kind::Constant, error + from_mean + energy));
     }
+    // sums of terms are rounded in f32 when a value is asked for: in proportion to the values, over all of them
+    let rounding = EVALUATION * (exact_mean * exact_mean * fit.count as f64 + energy).sqrt();
+    let within = |squared: f64| (squared.sqrt() + rounding).powi(2) <= bound;
     let largest = rest.iter().fold(0.0f64, |m, c| m.max(c.abs()));
     for (kind, steps) in [(Kind::Cubic8, 127.0), (Kind::Cubic16, 32_767.0)] {
         let step = (largest / steps) as f32;
@@ -93,7 +98,7 @@ pub(crate) fn encode_cubic(fit: &Fit, bound: f64, out: &mut Vec<u8>) -> Option<(
             *r = ((c * inverse + MAGIC) - MAGIC).clamp(-steps, steps);
             lost += (c - *r * f64::from(step)).powi(2);
         }
-        if step > 0.0 && lost <= room {
+        if step > 0.0 && lost <= room && within(error + lost) {
             out.extend_from_slice(&mean.to_le_bytes());
             out.extend_from_slice(&step.to_le_bytes());
             match kind {
@@ -104,7 +109,7 @@ pub(crate) fn encode_cubic(fit: &Fit, bound: f64, out: &mut Vec<u8>) -> Option<(
         }
     }
     let lost: f64 = from_mean + rest.iter().map(|&c| (c - f64::from(c as f32)).powi(2)).sum::<f64>();
-    if error + lost > bound {
+    if !within(error + lost) {
         return None;
     }
     out.extend_from_slice(&mean.to_le_bytes());

@@ -17,6 +17,9 @@ use std::{cmp::Reverse, collections::BinaryHeap};
 /// Edges of the boxes [voxels].
 const EDGES: [usize; 3] = [32, BLOCK, 1];
 
+/// Most steps along the surface from a cell.
+const STEPS: usize = 40;
+
 /// A point of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Nearest {
@@ -121,7 +124,8 @@ pub fn nearest_surface(lattice: &(impl Lattice + ?Sized), window: Window, iso: f
     best
 }
 
-/// The point of the surface in a cell nearest to `from`: onto the surface, along its tangent plane towards `from`, again and again.
+/// The point of the surface nearest to `from` that is found from a cell: onto the surface, along its tangent plane towards `from`, again and again, also
+/// through neighbouring cells. What it finds there is a point of the surface as well, and where the nearest one lies on a wall no wall stops it.
 fn on_surface(
     spline: &Spline,
     iso: f64,
@@ -130,20 +134,22 @@ fn on_surface(
     spacing: Vector3<f64>,
     low: [usize; 3],
 ) -> Option<Vector3<f64>> {
-    let within = |p: Vector3<f64>| Vector3::from_fn(|c, _| p[c].clamp(low[c] as f64, low[c] as f64 + 1.0));
+    let within = |p: Vector3<f64>| Vector3::from_fn(|c, _| p[c].clamp(low[c] as f64 - 1.0, low[c] as f64 + 2.0));
     let limited = |step: Vector3<f64>, most: f64| {
         let step = step.component_div(&spacing);
         step * (most / step.amax().max(1e-12)).min(1.0)
     };
+    let enough = 1e-4 * spacing.min();
     let mut p = Vector3::from(start);
     let mut best: Option<(f64, Vector3<f64>)> = None;
     // far from a strongly curved surface the tangent plane's foot lies beyond the nearest point: whenever the way turns back, go less far
     let (mut before, mut part) = (Vector3::zeros(), 1.0);
-    for _ in 0..12 {
+    for _ in 0..STEPS {
         // onto the surface
         let mut tangent = None;
-        for _ in 0..4 {
-            let (value, g) = spline.sample(p.into())?;
+        for _ in 0..6 {
+            // at the end of the loaded block the search stays with what it has
+            let Some((value, g)) = spline.sample(p.into()) else { return best.map(|(_, p)| p) };
             // in mm
             let g = g.component_div(&spacing);
             let squared = g.norm_squared();
@@ -155,7 +161,6 @@ fn on_surface(
                 tangent = Some((g, squared));
                 break;
             }
-            // what lies outside the cell is another's
             p = within(p + limited(g * off, 0.7));
         }
         let Some((g, squared)) = tangent else { break };
@@ -170,7 +175,7 @@ fn on_surface(
         }
         before = along;
         let next = within(p + limited(along * part, 0.5));
-        if (next - p).amax() < 1e-4 {
+        if (next - p).component_mul(&spacing).norm() < enough {
             break;
         }
         p = next;

@@ -317,3 +317,19 @@ fn a_real_head_is_within_the_bound_everywhere() {
     assert!(measured.worst_rms <= 10.001, "{measured:?}");
     assert!(tally.ratio() < 0.5, "{tally:?}");
 }
+
+#[test]
+fn a_bound_near_the_rounding_of_values_is_kept_as_well() {
+    for (slope, size) in [(1.0, [71, 41, 69]), (37.0, [108, 64, 20])] {
+        let mut ramp = volume(size, |i, j, k| (i as i32 * 200 - 12_000 + j as i32 * 130 + k as i32 * 37).clamp(-32_768, 32_767) as i16);
+        ramp.info.rescale = Rescale { slope, intercept: -1024.0 };
+        for bound in [0.0, 1e-3, 0.3, 10.0, 200.0] {
+            for tolerance in [Tolerance::SumOfSquares(bound), Tolerance::Rms(bound)] {
+                let (bricks, octree) = build(&ramp, Options { tolerance, ..Options::default() });
+                let measured = octree.measure(&bricks);
+                let worst = if matches!(tolerance, Tolerance::Rms(_)) { measured.worst_rms } else { measured.worst_sum };
+                assert!(worst <= bound * (1.0 + 1e-9), "slope {slope}, {tolerance:?}: {worst}");
+            }
+        }
+    }
+}
