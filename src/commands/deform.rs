@@ -4,7 +4,7 @@
 //! grid's axes: component c of a voxel is the limit of its link to the next voxel along axis c, for every component of the
 //! displacement *along the grid's axes* (rotate the written vectors back by the direction cosines to check them).
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, keep_apart};
 use maille_chainmail::{
     Admission, ChainMail, ChangedRegion, LinkModel, Metric, Motion, Pin, PushOutcome, Tissue, Triangle, enclosing_elements,
 };
@@ -167,11 +167,8 @@ const FARTHEST_MM: f64 = 1e6;
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let tissue = tissue(args)?;
-    let written: Vec<_> =
-        [Some(&args.output), args.displacement.as_ref(), args.limits.as_ref(), args.links.as_ref()].into_iter().flatten().collect();
-    if let Some(twice) = written.iter().enumerate().find_map(|(n, path)| written[..n].contains(path).then_some(path)) {
-        return Err(Failure::Usage(format!("{} is to be written twice: give each output a file of its own", twice.display())));
-    }
+    let outputs = [Some(&args.output), args.displacement.as_ref(), args.limits.as_ref(), args.links.as_ref()];
+    keep_apart([args.volume.as_path()], outputs.into_iter().flatten().map(PathBuf::as_path))?;
     let refused = |sentence: String| Failure::Refused(sentence);
     let reading = read(&args.volume, &ReadOptions::default()).map_err(|e| refused(e.to_string()))?;
     let volume = Volume::from_image(&reading.image).map_err(|e| refused(format!("{}: {e}", args.volume.display())))?;

@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> Outcome {
         rounds: usize::from(args.rounds),
         only: args.only.clone(),
     };
-    make(args.output.as_deref())?;
+    make(args.output.as_deref(), args.scene.iter().chain(&args.volume), &["effects.html", "effects.json", "effects.md"])?;
     let report = effects(&options, |what| eprintln!("maille: {what}")).map_err(failure)?;
     if let Some(folder) = &args.output {
         write_all(

@@ -1,6 +1,6 @@
 //! `maille import`: any readable volume into another format, values and geometry unchanged.
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, keep_apart};
 use maille_volume::io::{self, ReadOptions, WriteOptions};
 use std::path::PathBuf;
 
@@ -32,11 +32,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Outcome {
     let refused = |error: &dyn std::fmt::Display| Failure::Refused(error.to_string());
-    if let (Ok(from), Ok(to)) = (args.source.canonicalize(), args.output.canonicalize())
-        && from == to
-    {
-        return Err(Failure::Refused(format!("{} is the file to be read; name another one to write", args.output.display())));
-    }
+    keep_apart([args.source.as_path()], [args.output.as_path()])?;
     let options = ReadOptions { series: args.series.clone(), frame: args.frame };
     let reading = io::read(&args.source, &options).map_err(|e| refused(&e))?;
     for notice in &reading.notices {

@@ -3,7 +3,7 @@
 //! Given u, rest → deformed [mm, LPS] on the rest grid; written v with x + v(x) = X and X + u(X) = x on the same grid, NaN where no such X was
 //! found inside. Every v was checked: |v + u(x + v)| is at most the tolerance.
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, keep_apart};
 use maille_motion::model::{FieldInverse, invert_field};
 use maille_motion::resample::jacobian_determinant;
 use maille_volume::io::{ReadOptions, read, write_image, write_vector_field};
@@ -47,14 +47,10 @@ pub fn run(args: &Args) -> Outcome {
             args.tolerance
         )));
     }
-    for output in [Some(&args.output), args.residual.as_ref(), args.folds.as_ref()].into_iter().flatten() {
-        writable(output)?;
-        if let (Ok(from), Ok(to)) = (args.field.canonicalize(), output.canonicalize())
-            && from == to
-        {
-            return Err(Failure::Refused(format!("{} is the field to be read; name another file to write", output.display())));
-        }
-    }
+    let outputs = [Some(&args.output), args.residual.as_ref(), args.folds.as_ref()];
+    let outputs = || outputs.iter().flatten().map(|path| path.as_path());
+    outputs().try_for_each(writable)?;
+    keep_apart([args.field.as_path()], outputs())?;
     let field = read_field(&args.field)?;
     let start = Instant::now();
     let found = invert_field(&field, args.tolerance).map_err(|e| Failure::Refused(format!("{}: {e}", args.field.display())))?;

@@ -2,7 +2,8 @@
 //!
 //! Exit status (DESIGN section 10): 0 done, 1 refused or failed with one sentence on standard error, 2 wrong use.
 
-use std::fmt;
+use maille_volume::io::{OutputError, check_outputs};
+use std::{fmt, path::Path};
 
 pub mod check;
 pub mod clean;
@@ -36,6 +37,14 @@ pub enum Failure {
 
 /// What a command returns.
 pub type Outcome = Result<(), Failure>;
+
+/// Refuses, before any work, outputs that would take the place of an input or of one another, or that cannot be written.
+fn keep_apart<'i, 'o>(inputs: impl IntoIterator<Item = &'i Path>, outputs: impl IntoIterator<Item = &'o Path>) -> Outcome {
+    check_outputs(inputs, outputs).map_err(|fault| match fault {
+        OutputError::Twice { .. } => Failure::Usage(fault.to_string()),
+        fault => Failure::Refused(fault.to_string()),
+    })
+}
 
 impl Failure {
     /// The process's exit status.

@@ -7,7 +7,7 @@ mod eval;
 mod read;
 mod tell;
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, keep_apart};
 use eval::{EvalArgs, eval};
 use maille_motion::MotionModel;
 use maille_motion::model::{Keep, Kind, PcaReport, Precision, RIDGE, filter, fit_full_cycle, fit_half_cycle, fit_surrogate};
@@ -15,7 +15,7 @@ use maille_motion::phases::{PhaseOptions, air_ml, ends, rates, register_phases};
 use maille_motion::quality::{LandmarkErrors, Quality, landmark_errors, quality, rms_hu};
 use maille_motion::resample::{CoarseError, coarsen, jacobian_determinant};
 use maille_volume::{ScalarField, VectorField};
-use read::{Given, read_landmarks, read_mask, read_phases, read_signals};
+use read::{Given, read_files, read_landmarks, read_mask, read_phases, read_signals};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -130,6 +130,7 @@ fn fit(args: &FitArgs) -> Outcome {
         return Err(Failure::Usage(format!("--ridge {} is no share of a variance; give 0 to below 1", args.ridge)));
     }
     let keep = args.pca.map(keep).transpose()?;
+    keep_apart(read_files(args).iter().map(PathBuf::as_path), [args.output.as_path()])?;
     let start = Instant::now();
     let given = read_phases(&args.phases)?;
     let (images, fields, qualities) = match given {

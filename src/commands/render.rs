@@ -1,6 +1,6 @@
 //! `maille render`: one picture of a volume, or of a scene at rest, without starting any process.
 
-use super::{Failure, Outcome, invert::read_field};
+use super::{Failure, Outcome, invert::read_field, keep_apart};
 use clap::{Args as ClapArgs, ValueEnum};
 use maille_motion::resample::sample;
 use maille_phantom::{Kind, Phantom};
@@ -168,7 +168,7 @@ pub fn run(args: &Args) -> Outcome {
     if args.threads == Some(0) || args.time == Some(0) {
         return Err(Failure::Usage("--threads and --time need at least 1".into()));
     }
-    let (volume, scene) = load(&args.input)?;
+    let (volume, scene) = load(&args.input, args)?;
     let mut bricks = BrickedVolume::from_volume(&volume);
     drop(volume);
     // what a scene says is found in the patient at rest
@@ -310,12 +310,17 @@ fn open_gpu(bricks: &BrickedVolume) -> Result<Renderer, Failure> {
 }
 
 /// The volume, and the scene if it came from one.
-fn load(path: &Path) -> Result<(Volume, Option<Scene>), Failure> {
+fn load(path: &Path, args: &Args) -> Result<(Volume, Option<Scene>), Failure> {
+    let more = &args.more;
+    let given = [Some(&args.input), more.labels.as_ref(), more.warp.as_ref(), more.overlay.as_ref()];
+    let given = || given.into_iter().flatten().chain(&more.mesh).map(PathBuf::as_path);
     let is_scene = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml"));
     if !is_scene {
+        keep_apart(given(), [args.output.as_path()])?;
         return Ok((read(path)?, None));
     }
     let scene = Scene::load(path).map_err(|e| Failure::Report(e.into()))?;
+    keep_apart(given().chain(scene.files()), [args.output.as_path()])?;
     let volume = match scene.volume.source() {
         VolumeSource::File(file) => read(&file)?,
         VolumeSource::Phantom { kind, size, seed } => {

@@ -1,6 +1,6 @@
 //! `maille surface`: the surface of a level set, a range or an organ as a mesh file; organs as labels and volumes.
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, keep_apart};
 use maille_surface::{
     Border, Mesh, Organ, PATCHES_PER_VOXEL, ResolutionError, Selection, decimate, marching_cubes_bricks, marching_cubes_patches,
     marching_cubes_vif, organ,
@@ -98,6 +98,8 @@ pub fn run(args: &Args) -> Outcome {
     }
     // the format first: nobody wants to wait for a file that cannot be written
     let write = args.output.as_deref().map(writer).transpose()?;
+    let outputs = [&args.output, &args.labels, &args.alone];
+    keep_apart([args.volume.as_path()], outputs.into_iter().flatten().map(PathBuf::as_path))?;
     let (volume, notices) = maille_volume::io::read_volume(&args.volume).map_err(|error| Failure::Refused(error.to_string()))?;
     for notice in notices {
         eprintln!("maille: {}: {notice}", args.volume.display());

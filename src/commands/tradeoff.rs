@@ -1,8 +1,13 @@
 //! `maille tradeoff`.
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, keep_apart};
 use maille_tradeoff::{Effort, Options, TradeoffError, curves, tradeoff};
-use std::{fs, io::Write as _, path::PathBuf, time::Duration};
+use std::{
+    fs,
+    io::Write as _,
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 /// `--quick` is done after this time; writing takes less than what is missing to a minute.
 const QUICK: Duration = Duration::from_secs(57);
@@ -55,7 +60,7 @@ pub fn run(args: &Args) -> Outcome {
         volume: args.volume.clone(),
         data: std::env::var_os("MAILLE_DATA").map(PathBuf::from),
     };
-    make(args.output.as_deref())?;
+    make(args.output.as_deref(), &args.volume, &["tradeoff.html", "tradeoff.json", "tradeoff.md", "fronts.json"])?;
     let report = tradeoff(&options, |curve| eprintln!("maille: {}", curve.name)).map_err(failure)?;
     if let Some(folder) = &args.output {
         write_all(
@@ -82,15 +87,17 @@ pub(super) fn failure(error: TradeoffError) -> Failure {
     }
 }
 
-/// The folder for what will be measured, made before: one that cannot be made is told at the start.
-pub(super) fn make(folder: Option<&std::path::Path>) -> Outcome {
+/// The folder for what will be measured, made before: one that cannot be made, or whose files cannot be written, is told at the start.
+pub(super) fn make<'a>(folder: Option<&Path>, inputs: impl IntoIterator<Item = &'a PathBuf>, names: &[&str]) -> Outcome {
     let Some(folder) = folder else { return Ok(()) };
-    fs::create_dir_all(folder).map_err(|e| Failure::Refused(format!("{} cannot be written: {e}", folder.display())))
+    fs::create_dir_all(folder).map_err(|e| Failure::Refused(format!("{} cannot be written: {e}", folder.display())))?;
+    let outputs: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
+    keep_apart(inputs.into_iter().map(PathBuf::as_path), outputs.iter().map(PathBuf::as_path))
 }
 
 /// Writes files into a folder, which is made.
-pub(super) fn write_all(folder: &std::path::Path, files: &[(&str, String)]) -> Outcome {
-    let refused = |path: &std::path::Path, e: std::io::Error| Failure::Refused(format!("{} cannot be written: {e}", path.display()));
+pub(super) fn write_all(folder: &Path, files: &[(&str, String)]) -> Outcome {
+    let refused = |path: &Path, e: std::io::Error| Failure::Refused(format!("{} cannot be written: {e}", path.display()));
     fs::create_dir_all(folder).map_err(|e| refused(folder, e))?;
     for (name, text) in files {
         let path = folder.join(name);

@@ -51,6 +51,7 @@ pub use report::{BreathingReport, RunReport};
 use fronts::Fronts;
 use maille_contract::Role;
 use maille_scene::{Device, Scene};
+use maille_volume::io::check_outputs;
 use signals::Signals;
 use simulation::{Ready, Simulation};
 use std::{
@@ -123,6 +124,7 @@ pub fn run(options: &RunOptions) -> Result<RunReport, SupervisorError> {
     if let Some(vet) = options.vet {
         vet(&scene).map_err(SupervisorError::Refused)?;
     }
+    keep_apart(&scene, options)?;
     scene.console.enabled &= !options.headless;
     let fronts = Fronts::open(options.fronts.as_deref())?;
     for removed in stale::clean_dead_runs()? {
@@ -193,6 +195,19 @@ fn finish(report: RunReport, options: &RunOptions) -> Result<RunReport, Supervis
     }
     output::flush(LAST_WORDS);
     Ok(report)
+}
+
+/// Refuses to write over what the run reads.
+fn keep_apart(scene: &Scene, options: &RunOptions) -> Result<(), SupervisorError> {
+    let moves = match &options.device {
+        Some(Device::PathFile(file)) => Some(file),
+        _ => None,
+    };
+    let given = [options.scene.as_ref(), options.volume.as_ref(), options.motion.as_ref(), options.fronts.as_ref(), moves];
+    let inputs = given.into_iter().flatten().map(PathBuf::as_path).chain(scene.files());
+    let plot = options.report.as_ref().filter(|_| scene.has_effect("needle")).map(|report| report.with_extension("svg"));
+    let outputs: Vec<PathBuf> = options.report.iter().cloned().chain(plot).chain(scene.recording_file()).collect();
+    check_outputs(inputs, outputs.iter().map(PathBuf::as_path)).map_err(|fault| SupervisorError::Refused(fault.to_string()))
 }
 
 /// Finds out at the start, not after an hour's run, that a report has no place to go.

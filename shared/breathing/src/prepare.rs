@@ -25,7 +25,7 @@ pub struct Prepared {
     pub size: [usize; 3],
     /// number of fields
     pub fields: usize,
-    /// longest displacement at usual breathing, at most [mm]
+    /// longest displacement at usual breathing [mm]
     pub longest_mm: f64,
     /// largest difference that nodes so far apart make, at usual breathing [mm]
     pub spacing_error_mm: f64,
@@ -74,7 +74,6 @@ pub fn prepare(scene: &Scene, volume: &Grid) -> Result<Option<Prepared>, Breathi
     };
     let storage_error_mm = f64::from(model.usual_storage_error_mm());
     let bytes = model.to_bytes();
-    let longest = |level| model.bounds(&model.weights(&maille_motion::Breath { level, rate: 0.0, phase: 0.5 * (1.0 - level) })).0;
     Ok(Some(Prepared {
         header: MotionHeader { bytes: bytes.len() as u64, storage_error_mm },
         model: bytes,
@@ -82,7 +81,7 @@ pub fn prepare(scene: &Scene, volume: &Grid) -> Result<Option<Prepared>, Breathi
         recorded,
         size: model.grid().size,
         fields: model.fields().len(),
-        longest_mm: f64::from(longest(0.0).max(longest(1.0))),
+        longest_mm: f64::from(model.usual_longest_mm()),
         spacing_error_mm: f64::from(spacing_error_mm),
         storage_error_mm,
     }))

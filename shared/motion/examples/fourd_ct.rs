@@ -4,8 +4,8 @@
 
 use maille_motion::model::{RIDGE, fit_full_cycle, fit_half_cycle, fit_surrogate};
 use maille_motion::phases::{air_ml, ends, rates};
-use maille_motion::quality::rms_hu;
-use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, lung_mask, register};
+use maille_motion::quality::{LARGE_MM3, bones, rms_hu};
+use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, bone_pieces, lung_mask, register};
 use maille_motion::resample::{coarsen, jacobian_determinant};
 use maille_motion::{MotionModel, Precision, Weights};
 use maille_volume::{ScalarField, VectorField, io::read_image};
@@ -56,6 +56,7 @@ fn main() {
         Anatomy { slides: has("--sliding").then_some(&mask[..]), stiff: (has("--sliding") || has("--stiff")).then_some(&bone[..]) };
     // bone itself, to judge: what is bright inside the mask
     let bone: Vec<bool> = reference.values.iter().zip(&bone).map(|(&v, b)| *b && v > 200.0).collect();
+    let pieces = bone_pieces(reference, LARGE_MM3 as usize);
     let still = VectorField::zeros(reference.grid.clone());
     let mut fields = vec![still.clone()];
     let (mut total, mut seconds) = (0.0, 0.0f64);
@@ -102,6 +103,13 @@ fn main() {
             100.0 * off,
             jump / f64::max(pairs, 1.0)
         );
+        for bone in bones(&pieces, &u) {
+            let ([low, high], [x, y, z]) = (bone.determinant, bone.center);
+            println!(
+                "          bone of {:4.1} ml about {x:.0}, {y:.0}, {z:.0} mm: det J {low:.3} … {high:.3} (5 to 95 %)",
+                bone.mm3 / 1000.0
+            );
+        }
         total += after;
         seconds = seconds.max(took);
         fields.push(u);

@@ -5,8 +5,8 @@
 
 use crate::Precision;
 use crate::model::{Collapsed, fit_half_cycle};
-use crate::quality::{Quality, consistency, quality};
-use crate::register::{Anatomy, RegisterOptions, bone_mask, lung_mask, register};
+use crate::quality::{LARGE_MM3, Quality, bones, consistency, quality};
+use crate::register::{Anatomy, RegisterOptions, bone_mask, bone_pieces, lung_mask, register};
 use maille_volume::{ScalarField, VectorField};
 use rayon::prelude::*;
 
@@ -43,6 +43,7 @@ pub fn register_phases(
         );
     }
     let masks = lung.map(|lung| (lung, bone_mask(rest)));
+    let pieces = bone_pieces(rest, (LARGE_MM3 / rest.grid.spacing.iter().product::<f64>()).ceil() as usize);
     let field = |(n, phase): (usize, &ScalarField)| {
         if n == reference {
             let still = VectorField::zeros(rest.grid.clone());
@@ -51,6 +52,7 @@ pub fn register_phases(
         }
         let u = register(rest, phase, &anatomy(masks.as_ref()), &options.register, |level, iteration, _| progress(n, level, iteration))?;
         let mut quality = quality(Some((rest, phase)), &u).map_err(|fault| fault.to_string())?;
+        quality.bones = bones(&pieces, &u);
         if options.consistency {
             // what slides there is what slides here, where it has gone; bone is found as well there as here
             let masks = masks.as_ref().map(|(lung, _)| (carried(lung, &u), bone_mask(phase)));
@@ -126,7 +128,7 @@ mod tests {
         let phases = [image(0.0), image(2.0)];
         let found = register_phases(&phases, 0, &PhaseOptions::default(), |_, _, _| {}).unwrap();
         assert_eq!(found[0].1.rms_hu, Some([0.0, 0.0]));
-        let (q, rms) = (found[1].1, found[1].1.rms_hu.unwrap());
+        let (q, rms) = (&found[1].1, found[1].1.rms_hu.unwrap());
         assert!(rms[1] < 0.15 * rms[0] && q.folded == 0 && q.without_inverse == 0 && q.determinant[0] > 0.0, "{q:?}");
         assert!((found[1].0.vectors[grid.offset(20, 18, 16)][2] - 2.0).abs() < 0.3);
         // both ways agree to a fraction of a voxel where a shift is the truth

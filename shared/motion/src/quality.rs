@@ -2,7 +2,7 @@
 //!
 //! With x = X + u(X) and v the inverse of u as models use it ([`Collapsed`]):
 //! - images: RMS of phase(X + u) − reference(X) before and after [HU], without a margin whose tissue has left the image;
-//! - tissue: det J = det(1 + ∂u/∂X), and how many cells fold;
+//! - tissue: det J = det(1 + ∂u/∂X), how many cells fold, and of each large bone its det J from 5 to 95 %;
 //! - the way back: |v(x) + u(x + v(x))| [mm] at the nodes x that have an inverse, and how many have none. It says what inversion and storage cost,
 //!   nothing of whether the motion is right;
 //! - inverse consistency [Christensen & Johnson 2001]: with w of a second registration, phase to reference, |u(X) + w(X + u(X))| [mm] at the nodes that stay
@@ -21,7 +21,7 @@ use rayon::prelude::*;
 pub const MARGIN: usize = 8;
 
 /// What a field is worth.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Quality {
     /// RMS of the difference of the images before and after [HU], where there are images
     pub rms_hu: Option<[f64; 2]>,
@@ -37,6 +37,42 @@ pub struct Quality {
     pub longest_mm: f32,
     /// |u + w(X + u)|, where the phase was registered both ways
     pub consistency_mm: Option<Lengths>,
+    /// of each large bone of the reference by itself, the largest first, where there are images
+    pub bones: Vec<BoneQuality>,
+}
+
+/// How stiff one bone is, or bones that touch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BoneQuality {
+    /// its volume above 200 HU [mm³]
+    pub mm3: f64,
+    /// its middle [mm, LPS]
+    pub center: [f64; 3],
+    /// det J exceeded by 95 % of it, and by 5 %
+    pub determinant: [f32; 2],
+}
+
+/// A bone of this volume is judged by itself [mm³]; less may be calcium in soft tissue, or the end of a bone that the image cuts off.
+pub const LARGE_MM3: f64 = 2000.0;
+
+/// Judges bones of the reference ([`crate::register::bone_pieces`]) by the det J of the cells at their voxels.
+pub fn bones(pieces: &[Vec<usize>], u: &VectorField) -> Vec<BoneQuality> {
+    let (grid, determinant) = (&u.grid, jacobian_determinant(u));
+    let [nx, ny, _] = grid.size;
+    let judged = |piece: &Vec<usize>| {
+        let mut of: Vec<f32> = piece.iter().map(|&n| determinant.values[n]).collect();
+        of.sort_unstable_by(f32::total_cmp);
+        let sum = piece.iter().fold([0.0; 3], |sum: [f64; 3], &n| {
+            let at = [n % nx, n / nx % ny, n / (nx * ny)];
+            std::array::from_fn(|c| sum[c] + at[c] as f64)
+        });
+        BoneQuality {
+            mm3: piece.len() as f64 * grid.spacing.iter().product::<f64>(),
+            center: grid.world_from_index(sum.map(|s| s / piece.len() as f64)),
+            determinant: [5, 95].map(|share| of[(of.len() - 1) * share / 100]),
+        }
+    };
+    pieces.iter().filter(|piece| !piece.is_empty()).map(judged).collect()
 }
 
 /// Lengths, or errors, told in few numbers [mm].
@@ -93,6 +129,7 @@ pub fn quality(images: Option<(&ScalarField, &ScalarField)>, u: &VectorField) ->
         way_back_mm: Lengths::of(lengths),
         longest_mm: model.fields()[0].longest_mm(),
         consistency_mm: None,
+        bones: Vec::new(),
     })
 }
 

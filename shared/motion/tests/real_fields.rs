@@ -67,6 +67,27 @@ fn landmarks_are_carried_as_published_and_the_inverse_brings_them_back() {
     assert!(failed * 100 < inside, "{failed}");
 }
 
+/// The published evaluation: 1.59 mm in the mean. Where the hundred points of the baseline are in the follow-up is in elastix' own repository
+/// (`Testing/Baselines/3DCT_lung_groundtruth_point.txt`) and no part of these data.
+#[test]
+fn the_published_landmarks_are_met_where_those_of_the_follow_up_are_given() {
+    let Some(followup) = std::env::var_os("MAILLE_ELASTIX_FOLLOWUP") else {
+        eprintln!("SKIPPED: MAILLE_ELASTIX_FOLLOWUP names no file: elastix' Testing/Baselines/3DCT_lung_groundtruth_point.txt");
+        return;
+    };
+    let Some(folder) = real_data("ct_lung_elastix") else { return };
+    let image = read_image(&folder.join("derived_displacement_baseline_to_followup.mha")).unwrap();
+    let field = VectorField::from_image(&image).unwrap();
+    let read = |path: &std::path::Path| points(&std::fs::read(path).unwrap(), None, &field.grid).unwrap();
+    let (rest, there) = (read(&folder.join("3DCT_lung_baseline_landmarks.txt")), read(followup.as_ref()));
+    assert!(rest.len() == there.len() && rest.len() >= 100, "{} and {} points", rest.len(), there.len());
+    let pairs: Vec<_> = rest.into_iter().zip(there).map(|(p, q)| [p, q]).collect();
+    let found = landmark_errors(&field, &pairs);
+    println!("{} landmarks inside: {:.2} → {:.3} mm", found.after_mm.count, found.before_mm.mean, found.after_mm.mean);
+    // the B-spline itself gives 1.588; the field holds it at nodes some millimetres apart, and is trilinear between them (SciPy: 1.575)
+    assert!((found.after_mm.mean - 1.59).abs() < 0.03, "{found:?}");
+}
+
 /// As in the scene of a liver's puncture on the real 4D CT: the hand goes to and fro along the needle's way between two ribs, the patient breathes by fields of
 /// registration, sliding along the pleura. At every tick of 1 ms the place at rest is found again from where it was a tick before.
 #[test]

@@ -1,6 +1,7 @@
 //! Registration against motions that are known, and on a real 4D CT.
 
-use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, lung_mask, register};
+use maille_motion::quality::{LARGE_MM3, bones};
+use maille_motion::register::{Anatomy, RegisterOptions, bone_mask, bone_pieces, lung_mask, register};
 use maille_motion::resample::{jacobian_determinant, sample};
 use maille_testkit::{Displacement, RadialBump, SinusoidalShear, real_data};
 use maille_volume::{Grid, ScalarField, VectorField, io::read_image};
@@ -155,4 +156,8 @@ fn a_real_breath_is_followed_and_the_pleura_slides() {
     // SimpleITK's demons reach 34.2 HU on average over the phases, and this phase is the hardest
     assert!(before > 150.0 && after < 33.0 && sliding < 36.0, "{before} {after} {sliding}");
     assert!(least > 0.0 && jump(&free) > 2.0 * jump(&bound) && still_bone < 0.05 && still_bone < 0.5 * soft_bone);
+    // each large bone by itself, a rib along which nothing can be seen to slide among them
+    let judged = bones(&bone_pieces(&reference, LARGE_MM3 as usize), &free);
+    println!("bones: {judged:?}");
+    assert!(judged.len() >= 5 && judged.iter().flat_map(|b| b.determinant).all(|d| (d - 1.0).abs() < 0.05), "{judged:?}");
 }

@@ -1,7 +1,7 @@
 //! A scene as it stands in its file: plain data, with what the file leaves out filled in.
 
 use crate::{
-    breathing::Breathing,
+    breathing::{Breathing, Signal},
     incision::Incision,
     mesh::Mesh,
     needle::Needle,
@@ -12,7 +12,10 @@ use crate::{
     tool::{DeviceSection, Tool},
 };
 use serde::{Deserialize, Serialize};
-use std::{collections::BTreeMap, path::PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 /// How accurate the scene wants to be: sets the default of every knob.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -250,6 +253,18 @@ impl Scene {
             EffectSetting::Settings(table) => table.get("file").and_then(toml::Value::as_str),
         };
         Some(named.unwrap_or(recording::FILE).into())
+    }
+
+    /// The files that it names and that are read in a run, as they were found; way points of another file are its own by now.
+    pub fn files(&self) -> Vec<&Path> {
+        let recorded = match &self.breathing.signal {
+            Signal::Recorded(file) => Some(file.as_path()),
+            _ => None,
+        };
+        let named = [&self.volume.file, &self.volume.labels, &self.breathing.model, &self.device.library];
+        let named = named.into_iter().chain(self.meshes.iter().map(|mesh| &mesh.file)).flatten().map(PathBuf::as_path);
+        // a transfer function is a file or one of the presets, of which no file needs to be there
+        named.chain(recorded).chain([Path::new(&self.rendering.transfer)]).collect()
     }
 
     /// Number of the organ that is shown alone, from 1; 0 shows the whole patient.

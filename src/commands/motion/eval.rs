@@ -1,7 +1,7 @@
 //! `maille motion eval`: the displacement of a model at a moment.
 
 use super::{Failure, Outcome, kind_name, places, refused};
-use crate::commands::invert::writable;
+use crate::commands::{invert::writable, keep_apart};
 use maille_motion::MotionModel;
 use maille_motion::model::{Collapsed, Kind, Weights};
 use maille_motion::resample::jacobian_determinant;
@@ -42,6 +42,7 @@ struct Moment {
 /// Runs the command.
 pub(super) fn eval(args: &EvalArgs) -> Outcome {
     writable(&args.output)?;
+    keep_apart([args.model.as_path()], [args.output.as_path()])?;
     let name = args.model.display();
     let bytes = std::fs::read(&args.model).map_err(|e| Failure::Refused(format!("{name} cannot be read: {e}")))?;
     let model = MotionModel::view(&bytes).map_err(|e| Failure::Refused(format!("{name}: {e}; give what `maille motion fit` wrote")))?;

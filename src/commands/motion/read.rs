@@ -1,6 +1,6 @@
 //! What `maille motion fit` reads: phases, signals, a mask, landmarks.
 
-use super::{Failure, Outcome, refused};
+use super::{Failure, FitArgs, Outcome, refused};
 use crate::commands::invert::sound_field;
 use maille_motion::{landmarks, quality::mask_on};
 use maille_volume::io::{ReadOptions, read};
@@ -150,12 +150,22 @@ pub(super) fn read_landmarks(given: &[String], phases: usize, grid: &Grid) -> Re
     given.chunks_exact(3).map(of).collect()
 }
 
+/// All files that a fit reads.
+pub(super) fn read_files(args: &FitArgs) -> Vec<PathBuf> {
+    let points = args.landmarks.chunks_exact(3).flat_map(|three| &three[1..]).map(|name| PathBuf::from(point_file(name).0));
+    args.phases.iter().chain(&args.signals).chain(&args.mask).cloned().chain(points).collect()
+}
+
 /// FILE, or FILE:VARIABLE of a MATLAB file.
-fn read_points(name: &str, grid: &Grid) -> Result<Vec<[f64; 3]>, Failure> {
-    let (path, variable) = match name.rsplit_once(':') {
+fn point_file(name: &str) -> (&str, Option<&str>) {
+    match name.rsplit_once(':') {
         Some((path, variable)) if !Path::new(name).exists() => (path, Some(variable)),
         _ => (name, None),
-    };
+    }
+}
+
+fn read_points(name: &str, grid: &Grid) -> Result<Vec<[f64; 3]>, Failure> {
+    let (path, variable) = point_file(name);
     let bytes = std::fs::read(path).map_err(|e| Failure::Refused(format!("{path} cannot be read: {e}")))?;
     landmarks::points(&bytes, variable, grid).map_err(|fault| Failure::Refused(format!("{path}: {fault}")))
 }

@@ -1,7 +1,7 @@
 //! What `maille motion fit` says of its fields and of the model.
 
 use super::{Filtered, FitArgs, Fitted, kind_name, places, reference};
-use maille_motion::quality::{LandmarkErrors, Lengths, Quality};
+use maille_motion::quality::{BoneQuality, LARGE_MM3, LandmarkErrors, Lengths, Quality};
 use serde_json::{Value, json};
 
 impl Fitted {
@@ -74,6 +74,17 @@ impl Fitted {
                 q.way_back_mm.worst,
                 q.way_back_mm.p95
             );
+            if let Some(worst) = softest(&q.bones) {
+                let [x, y, z] = worst.center;
+                println!(
+                    "          bones of {} ml and more: {}, the softest det J {:.3} … {:.3} (5 to 95 %; {:.1} ml about {x:.0}, {y:.0}, {z:.0} mm)",
+                    LARGE_MM3 / 1000.0,
+                    q.bones.len(),
+                    worst.determinant[0],
+                    worst.determinant[1],
+                    worst.mm3 / 1000.0
+                );
+            }
             if let Some(c) = q.consistency_mm {
                 println!(
                     "          there and back again, registered both ways: mean {:.2} mm, p95 {:.2}, worst {:.2}",
@@ -112,6 +123,12 @@ impl Fitted {
     }
 }
 
+/// The bone that changes its volume most.
+fn softest(bones: &[BoneQuality]) -> Option<&BoneQuality> {
+    let off = |b: &BoneQuality| b.determinant.iter().map(|d| (d - 1.0).abs()).fold(0.0, f32::max);
+    bones.iter().max_by(|a, b| off(a).total_cmp(&off(b)))
+}
+
 fn describe(n: usize, q: &Quality, landmarks: Option<&LandmarkErrors>, signal: Option<&Vec<f64>>) -> Value {
     let told = |l: Lengths| json!({ "count": l.count, "mean": l.mean, "sd": l.sd, "p95": l.p95, "worst": l.worst });
     json!({
@@ -125,5 +142,6 @@ fn describe(n: usize, q: &Quality, landmarks: Option<&LandmarkErrors>, signal: O
         "consistency_mm": q.consistency_mm.map(told),
         "landmarks": landmarks.map(|l| json!({ "outside": l.outside, "before_mm": told(l.before_mm), "after_mm": told(l.after_mm) })),
         "longest_mm": q.longest_mm,
+        "bones": q.bones.iter().map(|b| json!({ "mm3": b.mm3, "center": b.center, "determinant": b.determinant })).collect::<Vec<_>>(),
     })
 }

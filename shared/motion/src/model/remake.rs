@@ -85,6 +85,12 @@ impl MotionModel<'_> {
         usual().map(|breath| self.storage_error_mm(&self.weights(&breath))).fold(0.0, f32::max)
     }
 
+    /// Longest displacement at usual breathing [mm]: of the sums themselves, whose fields may cancel.
+    pub fn usual_longest_mm(&self) -> f32 {
+        let fields: Vec<VectorField> = self.fields().iter().map(|f| f.unpack(self.grid())).collect();
+        usual().map(|breath| longest(&fields, &self.weights(&breath))).fold(0.0, f32::max)
+    }
+
     /// Bounds of u under coefficients: length [mm], and contraction along the grid's axes in millimetres.
     pub fn bounds(&self, weights: &Weights) -> (f32, f32) {
         weights.iter().fold((0.0, 0.0), |(l, q), (k, c)| {

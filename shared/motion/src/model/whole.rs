@@ -8,7 +8,8 @@
 //!
 //! Search, for nodes without an answer: a cell's image lies in the box of its eight displaced corners, since trilinear interpolation is convex. So a node
 //! in no cell's box has no inverse on the grid, and that is proved; of the cells whose box holds it, the one whose affine part brings
-//! it nearest to its centre is tried. Bounded: one cell a node; boxes of more than [`WIDE`] nodes are only remembered as one box.
+//! it nearest to its centre is tried; if its affine part has the node's rest position inside and none can be claimed, as in folded tissue, that is a failure.
+//! Bounded: one cell a node; boxes of more than [`WIDE`] nodes are only remembered as one box.
 //!
 //! Cost: two to three evaluations a node. Memory: 16 bytes a node, and 8 more when nodes are searched. Deterministic.
 
@@ -33,7 +34,7 @@ pub struct FieldInverse {
     pub field: VectorField,
     /// |v + u(x + v)| [mm], or what bounds it: in f32 with a bound on its rounding; −1 where there is none
     pub residual_mm: ScalarField,
-    /// nodes whose rest position lies beyond the grid
+    /// nodes whose rest position lies beyond the grid, and nowhere on it as far as the affine parts of its cells tell
     pub outside: usize,
     /// nodes at which none was found, though one may lie inside
     pub failures: usize,
@@ -51,6 +52,12 @@ type Certified = (usize, f32);
 
 /// Nodes in the box of a cell beyond which the cell is not searched.
 const WIDE: usize = 512;
+
+/// Steps to a rest position in a cell count as no longer than this [voxels], so that those of folded cells, which come after, can be told from them.
+const FOLDED: f32 = 1024.0;
+
+/// A step from the centre no longer than this ends in the cell, as far as its affine part tells [voxels].
+const WITHIN: f32 = 0.5 + 1e-3;
 
 /// Contraction below which it counts as one.
 const CONTRACTS: f32 = 0.99;
@@ -337,11 +344,16 @@ impl<'a> Whole<'a> {
             }
             let cell = self.node((key & u64::from(u32::MAX)) as usize);
             let center = cell.map(|c| c as f32 + 0.5);
-            let step = self.affine_step(cell, node).map_or([0.0; 3], |s| s.map(|c| c.clamp(-0.499, 0.499) as f32).into());
+            let step = self.affine_step(cell, node).filter(|(_, det)| *det > 0.0);
+            let step = step.map_or([0.0; 3], |(s, _)| s.map(|c| c.clamp(-0.499, 0.499) as f32).into());
             let starts = [std::array::from_fn(|c| center[c] + step[c]), center];
             let found = starts.into_iter().find_map(|start| self.damped(node, start).and_then(|x| self.claim(node, x)));
+            let far = f32::from_bits((key >> 32) as u32);
             if let Some(found) = found {
                 ((*v, *r), *state) = (found, State::Settled);
+            } else if if far < 2.0 * FOLDED { far } else { far - 2.0 * FOLDED } <= WITHIN {
+                // whatever was found beyond the grid: this cell holds a rest position too, of tissue that is folded there, or nearly does
+                *state = State::Open;
             }
             usize::from(*state == State::Settled)
         };
@@ -374,8 +386,10 @@ impl<'a> Whole<'a> {
                 for i in low[0]..=high[0] {
                     let at = grid.offset(i, j, k);
                     if states[at] != State::Settled {
-                        // where the cell is folded its affine part says nothing, but it may hold the node in a part that is not
-                        let far = self.affine_step(cell, [i, j, k]).map_or(1e6, |s| s.amax().min(1e6)) as f32;
+                        // where the cell is folded its affine part is no way there, but it may hold the node in a part that is not: such come last
+                        let far = self.affine_step(cell, [i, j, k]).map_or(3.0 * FOLDED, |(s, det)| {
+                            s.amax().min(f64::from(FOLDED)) as f32 + if det > 0.0 { 0.0 } else { 2.0 * FOLDED }
+                        });
                         let key = u64::from(far.to_bits()) << 32 | grid.offset(cell[0], cell[1], cell[2]) as u64;
                         best[at].fetch_min(key, Relaxed);
                     }
@@ -384,13 +398,13 @@ impl<'a> Whole<'a> {
         }
     }
 
-    /// From a cell's centre to where its affine part has the rest position of a node.
-    fn affine_step(&self, cell: [usize; 3], node: [usize; 3]) -> Option<Vector3<f64>> {
+    /// From a cell's centre to where its affine part has the rest position of a node, and the affine part's det J; none where that is 0.
+    fn affine_step(&self, cell: [usize; 3], node: [usize; 3]) -> Option<(Vector3<f64>, f64)> {
         let center = cell.map(|c| c as f32 + 0.5);
         let here = self.at(center);
         let gradient = Matrix3::identity() + Matrix3::from_fn(|r, c| f64::from(here.jacobian[r][c]));
         let missing = Vector3::from_fn(|c, _| node[c] as f64 - f64::from(center[c]) - f64::from(here.u[c]));
-        (gradient.determinant() > 0.0).then(|| gradient.try_inverse()).flatten().map(|inverse| inverse * missing)
+        gradient.try_inverse().map(|inverse| (inverse * missing, gradient.determinant()))
     }
 }
 
@@ -532,6 +546,15 @@ mod tests {
         let found = invert_field(&folded, 1e-3).unwrap();
         assert!(found.failures > 0 && found.failures + found.outside == found.field.vectors.len(), "{} {}", found.failures, found.outside);
         assert_eq!(found.certified, 0);
+        // X ↦ 2c − X: each node but those of three faces has its one rest position inside, of tissue that is turned inside out
+        let grid = Grid::axis_aligned([24, 20, 16], [1.0; 3]);
+        let mut mirrored = VectorField::zeros(grid.clone());
+        for (n, v) in mirrored.vectors.iter_mut().enumerate() {
+            let at = [n % 24, n / 24 % 20, n / 480];
+            *v = std::array::from_fn(|c| -2.0 * (at[c] as f32 - [12.0, 10.0, 8.0][c]));
+        }
+        let found = invert_field(&mirrored, 1e-3).unwrap();
+        assert_eq!((found.failures, found.outside), (23 * 19 * 15, 24 * 20 * 16 - 23 * 19 * 15));
         let mut broken = folded;
         broken.vectors[77][1] = f32::NAN;
         assert_eq!(invert_field(&broken, 1e-3).unwrap_err(), MotionError::Vector { field: 0, node: 77 });

@@ -1,9 +1,11 @@
 //! The demons and their regularisation; see the module above.
 
+use super::mask::connected;
 use super::pyramid::{Lattice, Wanted, double, gradient, halve, smooth, smooth_lines, trilinear};
 use crate::resample::jacobian_determinant;
 use maille_displacement::in_patient;
 use maille_volume::{Grid, ScalarField, VectorField};
+use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 /// How two images are registered.
@@ -55,7 +57,22 @@ struct Bone {
     share: Vec<f32>,
     /// σ [blocks]
     sigma: f32,
+    /// those of one bone each
+    single: Vec<Piece>,
 }
+
+/// A bone by itself: a rib that is seen without its joint, a shoulder blade.
+struct Piece {
+    /// its nodes
+    nodes: Vec<u32>,
+    /// their middle [mm from the lattice's first node]
+    center: Vector3<f32>,
+    /// inverse of the inertia tensor about it, every node of mass 1 [1/mm²]
+    per_inertia: Matrix3<f32>,
+}
+
+/// A connected piece of bone of this volume is one bone [mm³]: less may be calcium in soft tissue, more are several with joints between them.
+const SINGLE_MM3: std::ops::Range<f32> = 3e3..4e4;
 
 /// Iterations from one stiffening of bone to the next.
 const STIFFEN: usize = 3;
@@ -113,6 +130,7 @@ pub fn register(
         ));
     }
     let mut coarser: Option<(Components, Option<Vec<f32>>)> = None;
+    let mut held = Vec::new();
     let skipped = options.iterations.len() - raw.len();
     for (n, (lattice, reference, phase, [slides, stiff])) in raw.into_iter().rev().enumerate() {
         let mut field = match &coarser {
@@ -123,10 +141,11 @@ pub fn register(
         let bone = stiff.map(|m| Bone::new(&lattice, &m, options.stiff_mm));
         let level = Level { lattice, reference, phase, border, bone };
         level.run(&mut field, options, options.iterations[n + skipped], |iteration, rms| progress(n, iteration, rms));
+        held = level.bone.iter().flat_map(|bone| &bone.single).flat_map(|piece| &piece.nodes).copied().collect();
         coarser = Some((field, level.border.map(|b| b.inside)));
     }
     let (field, _) = coarser.expect("there is a level");
-    Ok(unfold(grid, field, options.least_determinant))
+    Ok(unfold(grid, field, &held, options.least_determinant))
 }
 
 impl Border {
@@ -175,7 +194,9 @@ impl Bone {
         let nodes = slices.map(|slice| (0..slice.len() as u32).filter(|&n| slice[n as usize] > 0.5).collect()).collect();
         let blocks = Lattice { size: lattice.size.map(|s| s.div_ceil(2)), spacing: lattice.spacing.map(|s| 2.0 * s) };
         let sigma = (stiff_mm / blocks.spacing.iter().copied().fold(f32::INFINITY, f32::min)).max(0.5);
-        let mut bone = Self { nodes, blocks, share: Vec::new(), sigma };
+        let mut single = Vec::new();
+        connected(lattice.size, inside.iter().map(|v| *v > 0.5), |nodes| single.extend(Piece::new(lattice, nodes)));
+        let mut bone = Self { nodes, blocks, share: Vec::new(), sigma, single };
         let (mut share, mut spare) = (Vec::new(), Vec::new());
         bone.gather(lattice, |_| 1.0, &mut share);
         smooth(&blocks, sigma, &mut share, &mut spare);
@@ -198,10 +219,12 @@ impl Bone {
         });
     }
 
-    /// u in bone ← its mean over bone nearby.
+    /// u in bone ← its mean over bone nearby, and in a single bone its rigid part.
     fn stiffen(&self, lattice: &Lattice, field: &mut Components, part: &mut Vec<f32>, spare: &mut Vec<f32>) {
+        // before their neighbours have a part in it
+        let motions: Vec<_> = self.single.iter().map(|piece| piece.motion(lattice, field)).collect();
         let ([nx, _, _], slice) = (lattice.size, lattice.slice());
-        for u in field {
+        for u in field.iter_mut() {
             self.gather(lattice, |n| u[n], part);
             smooth(&self.blocks, self.sigma, part, spare);
             part.par_iter_mut().zip(&self.share).for_each(|(p, &s)| *p = if s > 0.0 { *p / s } else { 0.0 });
@@ -214,7 +237,47 @@ impl Bone {
                 }
             });
         }
+        for (piece, motion) in self.single.iter().zip(motions) {
+            piece.nodes.iter().for_each(|&n| {
+                let u = motion(place(lattice, n as usize));
+                (0..3).for_each(|c| field[c][n as usize] = u[c]);
+            });
+        }
     }
+}
+
+impl Piece {
+    fn new(lattice: &Lattice, nodes: &[usize]) -> Option<Self> {
+        let count = nodes.len() as f32;
+        if !SINGLE_MM3.contains(&(count * lattice.spacing.iter().product::<f32>())) {
+            return None;
+        }
+        let center = nodes.iter().map(|&n| place(lattice, n)).sum::<Vector3<f32>>() / count;
+        let inertia = nodes.iter().map(|&n| {
+            let d = place(lattice, n) - center;
+            Matrix3::from_diagonal_element(d.norm_squared()) - d * d.transpose()
+        });
+        let per_inertia = inertia.sum::<Matrix3<f32>>().try_inverse()?;
+        Some(Self { nodes: nodes.iter().map(|&n| n as u32).collect(), center, per_inertia })
+    }
+
+    /// The rigid motion nearest to u in it, for small turns: t + ω × (x − c) of least Σ |u − t − ω × (x − c)|², so t is the mean of u and ω its moment about
+    /// the middle by the inertia.
+    fn motion(&self, lattice: &Lattice, field: &Components) -> impl Fn(Vector3<f32>) -> Vector3<f32> + use<> {
+        let u = |n: &u32| Vector3::from(field.each_ref().map(|u| u[*n as usize]));
+        let mean = self.nodes.iter().map(u).sum::<Vector3<f32>>() / self.nodes.len() as f32;
+        let center = self.center;
+        let moment = self.nodes.iter().map(|n| (place(lattice, *n as usize) - center).cross(&u(n))).sum::<Vector3<f32>>();
+        let turn = self.per_inertia * moment;
+        move |x| mean + turn.cross(&(x - center))
+    }
+}
+
+/// A node's place [mm from the first].
+fn place(lattice: &Lattice, n: usize) -> Vector3<f32> {
+    let [nx, ny, _] = lattice.size;
+    let at = [n % nx, n / nx % ny, n / (nx * ny)];
+    Vector3::from_fn(|c, _| at[c] as f32 * lattice.spacing[c])
 }
 
 impl Level {
@@ -353,8 +416,9 @@ impl<'a> Around<'a> {
     }
 }
 
-/// Smooths around cells that fold, until none does or it has been tried often enough; vectors go to LPS.
-fn unfold(grid: &Grid, field: Components, least: f32) -> VectorField {
+/// Smooths around cells that fold, until none does or it has been tried often enough; vectors go to LPS. Nodes that are `held` are left as they are while
+/// their neighbours may yet give way: along the pleura, which tears, are the ribs.
+fn unfold(grid: &Grid, field: Components, held: &[u32], least: f32) -> VectorField {
     let lattice = Lattice { size: grid.size, spacing: grid.spacing.map(|s| s as f32) };
     let patient = |f: &Components| VectorField {
         grid: grid.clone(),
@@ -364,7 +428,7 @@ fn unfold(grid: &Grid, field: Components, least: f32) -> VectorField {
             .collect(),
     };
     let (mut field, mut spare) = (field, Vec::new());
-    for _ in 0..20 {
+    for round in 0..20 {
         let vectors = patient(&field);
         let folded: Vec<bool> = jacobian_determinant(&vectors).values.iter().map(|d| *d < least).collect();
         if !folded.iter().any(|f| *f) {
@@ -373,6 +437,9 @@ fn unfold(grid: &Grid, field: Components, least: f32) -> VectorField {
         // a cell and what lies within two nodes of it
         let mut near: Vec<f32> = folded.iter().map(|&f| f32::from(u8::from(f))).collect();
         smooth(&lattice, 1.0, &mut near, &mut spare);
+        if round < 14 {
+            held.iter().for_each(|&n| near[n as usize] = 0.0);
+        }
         for u in &mut field {
             let mut smoothed = u.clone();
             smooth(&lattice, 0.8, &mut smoothed, &mut spare);

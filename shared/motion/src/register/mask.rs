@@ -33,23 +33,44 @@ pub fn bone_mask(image: &ScalarField) -> Vec<bool> {
     mask
 }
 
+/// Bones of this many voxels or more above 200 HU, connected by faces: the voxels of each, the largest bone first.
+pub fn bone_pieces(image: &ScalarField, least: usize) -> Vec<Vec<usize>> {
+    let mut found = Vec::new();
+    connected(image.grid.size, image.values.iter().map(|&v| v > BONE_HU), |piece| {
+        if piece.len() >= least {
+            found.push(piece.to_vec());
+        }
+    });
+    found.sort_by_key(|piece| std::cmp::Reverse(piece.len()));
+    found
+}
+
 /// Voxels whose value is `of` the sort, in the pieces (connected by faces) that are kept by their count and mean.
 fn pieces(image: &ScalarField, of: impl Fn(f32) -> bool, keep: impl Fn(usize, f32) -> bool) -> Vec<bool> {
-    let ([nx, ny, nz], count) = (image.grid.size, image.values.len());
-    let mut mask = vec![false; count];
-    let mut seen: Vec<bool> = image.values.iter().map(|&v| !of(v)).collect();
+    let mut mask = vec![false; image.values.len()];
+    connected(image.grid.size, image.values.iter().map(|&v| of(v)), |piece| {
+        let sum: f64 = piece.iter().map(|&n| f64::from(image.values[n])).sum();
+        if keep(piece.len(), (sum / piece.len() as f64) as f32) {
+            piece.iter().for_each(|&n| mask[n] = true);
+        }
+    });
+    mask
+}
+
+/// Hands out the pieces, connected by faces, of what is `true`; i fastest.
+pub(super) fn connected([nx, ny, nz]: [usize; 3], of: impl Iterator<Item = bool>, mut out: impl FnMut(&[usize])) {
+    let mut seen: Vec<bool> = of.map(|v| !v).collect();
     let mut piece = Vec::new();
-    for start in 0..count {
+    for start in 0..seen.len() {
         if seen[start] {
             continue;
         }
         seen[start] = true;
         piece.clear();
         piece.push(start);
-        let (mut next, mut sum) = (0, 0.0f64);
+        let mut next = 0;
         while let Some(&n) = piece.get(next) {
             next += 1;
-            sum += f64::from(image.values[n]);
             let (i, j, k) = (n % nx, n / nx % ny, n / (nx * ny));
             let (row, slice) = (nx as isize, (nx * ny) as isize);
             let neighbours = [(i > 0, -1), (i + 1 < nx, 1), (j > 0, -row), (j + 1 < ny, row), (k > 0, -slice), (k + 1 < nz, slice)];
@@ -61,11 +82,8 @@ fn pieces(image: &ScalarField, of: impl Fn(f32) -> bool, keep: impl Fn(usize, f3
                 }
             }
         }
-        if keep(piece.len(), (sum / piece.len() as f64) as f32) {
-            piece.iter().for_each(|&n| mask[n] = true);
-        }
+        out(&piece);
     }
-    mask
 }
 
 /// One voxel more (or less) across faces; beyond the border the mask goes on as on it.

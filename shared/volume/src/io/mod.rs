@@ -17,9 +17,11 @@ mod geometry;
 mod metaimage;
 mod nifti;
 mod nrrd;
+mod outputs;
 mod payload;
 
 pub use error::{ReadError, WriteError};
+pub use outputs::{OutputError, check_outputs};
 
 use crate::{Image, Pixels, Rescale, VectorField, Volume};
 use error::{Fault, Parsed};
