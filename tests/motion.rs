@@ -414,6 +414,66 @@ fn images_of_a_breath_become_models_that_bring_it_back() {
     refused(&["motion", "eval", &scratch.file("cut.motion"), "--tau", "0", "-o", &u], 1, "cut.motion");
 }
 
+/// What is read stays as it is, whatever is named as output, and by whatever name; nothing is waited for.
+#[test]
+fn no_output_takes_the_place_of_an_input_or_of_another_output() {
+    let scratch = Scratch::new("apart");
+    let name = |n: &str| scratch.file(n);
+    let files = [name("s1.mha"), name("s2.mha")];
+    for (file, depth) in files.iter().zip([0.0, 3.0]) {
+        write_image(Path::new(file), &breath(depth).to_image()).unwrap();
+    }
+    let grid = Grid::axis_aligned([8, 7, 6], [1.0; 3]);
+    let field = name("u.nrrd");
+    write_vector_field(Path::new(&field), &VectorField::zeros(grid)).unwrap();
+    let model = name("m.nrrd");
+    told(&["motion", "fit", &field, "-o", &model, "--reference", "1", "--json"]);
+    for (file, text) in [("signals.txt", "1, 2\n3, 4\n"), ("points.txt", "point\n1\n5 5 5\n"), ("scene.toml", "name = \"s\"\n")] {
+        std::fs::write(name(file), text).unwrap();
+    }
+    std::fs::hard_link(&files[1], name("hard.mha")).unwrap();
+    std::os::unix::fs::symlink(&files[1], name("soft.mha")).unwrap();
+    std::fs::create_dir(name("folder")).unwrap();
+
+    let kept: Vec<(PathBuf, Vec<u8>)> = std::fs::read_dir(&scratch.0)
+        .unwrap()
+        .map(|f| f.unwrap().path())
+        .filter(|p| p.is_file())
+        .map(|p| (p.clone(), std::fs::read(p).unwrap()))
+        .collect();
+    let [a, b] = files.each_ref().map(String::as_str);
+    let read = "is a file that is to be read; name another file";
+    for output in [b.to_owned(), name("hard.mha"), name("soft.mha"), name("folder/../s2.mha")] {
+        refused(&["motion", "fit", a, b, "-o", &output], 1, read);
+        refused(&["import", b, "-o", &output], 1, read);
+    }
+    let (signals, points) = (name("signals.txt"), name("points.txt"));
+    refused(&["motion", "fit", a, b, "--signals", &signals, "-o", &signals], 1, read);
+    refused(&["motion", "fit", a, b, "--sliding", "--mask", &field, "-o", &field], 1, read);
+    refused(&["motion", "fit", a, b, "--landmarks", "2", &points, &points, "-o", &points], 1, read);
+    refused(&["motion", "eval", &model, "--phase", "2", "-o", &model], 1, read);
+    let out = name("v.nrrd");
+    refused(&["invert", &field, "-o", &field], 1, read);
+    refused(&["invert", &field, "-o", &out, "--residual", &field], 1, read);
+    refused(&["invert", &field, "-o", &out, "--residual", &name("folder/../v.nrrd")], 2, "is to be written twice");
+    let push = "30,30,30:1,0,0";
+    refused(&["deform", a, "--push", push, "-o", a], 1, read);
+    refused(&["deform", a, "--push", push, "-o", &out, "--displacement", a], 1, read);
+    refused(&["surface", a, "--iso", "-300", "--labels", a], 1, read);
+    refused(&["render", a, "-o", a], 1, read);
+    refused(&["render", a, "--warp", &field, "-o", &field], 1, read);
+    let scene = name("scene.toml");
+    refused(&["run", &scene, "--headless", "--duration", "1s", "--report", &scene], 1, read);
+    refused(&["run", &scene, "--volume", a, "--headless", "--duration", "1s", "--report", a], 1, read);
+    // and what cannot be written is told before the work
+    refused(&["motion", "fit", a, b, "-o", &name("nowhere/m")], 1, "nowhere/m cannot be written");
+    refused(&["motion", "fit", a, b, "-o", &name("folder")], 1, "folder cannot be written");
+    for (path, bytes) in kept {
+        assert!(std::fs::read(&path).unwrap() == bytes, "{}", path.display());
+    }
+    assert!(!Path::new(&out).exists());
+}
+
 #[test]
 fn phases_that_make_no_motion_are_refused_in_one_sentence() {
     let scratch = Scratch::new("phases");
