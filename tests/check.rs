@@ -193,6 +193,8 @@ fn what_was_measured_is_what_a_run_then_takes() {
         assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
         let report: Value = serde_json::from_str(&fs::read_to_string(&out).unwrap()).unwrap();
         fs::remove_file(&out).unwrap();
+        // the plot that goes with it
+        let _ = fs::remove_file(out.with_extension("svg"));
         for l in told["measured"]["loops"].as_array().unwrap() {
             let service = l["service"].as_str().unwrap();
             let (key, unit) = [("haptic", ("tick_us", 1.0)), ("deformation", ("step_us", 1.0)), ("rendering", ("frame_ms", 1e3))]

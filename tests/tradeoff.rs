@@ -146,3 +146,38 @@ fn an_effect_is_measured_by_runs_with_it_and_without_it() {
     assert!(page.contains("sections") && page.contains("<svg"));
     assert!(folder.read("effects.md").contains("| sections | view |"));
 }
+
+/// A needle in a patient who breathes: the view alone has neither, and what has them has both. A tool that never meets tissue ends its own runs only.
+#[test]
+fn an_effect_whose_run_fails_says_why_and_the_others_are_measured() {
+    let folder = Folder::new("effects-needle");
+    let scene = folder.0.join("needle.toml");
+    let text = |way: &str| {
+        format!(
+            "name = \"small\"\n[volume]\nphantom = \"torso\"\nsize = 32\n[breathing]\nperiod_s = 4.0\n[tool]\nkind = \"needle\"\n[tool.approach]\n{way}\n\
+             [rendering]\nsize = [64, 48]\nsection_size = [32, 24]\n[effects]\nbreathing = true\nneedle = true\nsections = true\n"
+        )
+    };
+    let measured = |way: &str, only: &[&str]| {
+        std::fs::write(&scene, text(way)).unwrap();
+        let mut args = vec!["effects", self::text(&scene), "--duration", "1500ms", "--json"];
+        only.iter().for_each(|name| args.extend(["--only", name]));
+        maille(&args)
+    };
+    let out = measured("from = [0.55, 0.0, 0.2]\ntoward = [0.55, 0.6, 0.2]", &["needle", "sections"]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let json: Value = serde_json::from_slice(&out.stdout).unwrap();
+    for effect in json["effects"].as_array().unwrap() {
+        assert!(effect["added"]["frame_ms"].is_object() && effect["note"].is_null(), "{effect}");
+    }
+    let nowhere = "from = [0.01, 0.0, 0.01]\ntoward = [0.02, 0.0, 0.01]";
+    let out = measured(nowhere, &["contact", "sections"]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let json: Value = serde_json::from_slice(&out.stdout).unwrap();
+    let [contact, sections] = &json["effects"].as_array().unwrap()[..] else { panic!("{json}") };
+    assert!(contact["added"].is_null() && contact["note"].as_str().is_some_and(|n| n.contains("a run failed")), "{contact}");
+    assert!(sections["added"]["frame_ms"].is_object(), "{sections}");
+    // a table of nothing is no answer
+    let out = measured(nowhere, &["contact"]);
+    assert!(!out.status.success() && String::from_utf8_lossy(&out.stderr).contains("no effect could be measured"), "{out:?}");
+}

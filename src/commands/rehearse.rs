@@ -5,7 +5,8 @@
 //!
 //! **Headroom** of a loop is 1 − time of a turn (99th percentile) over its period. A loop **holds** its rate when its median turn fits into the period,
 //! and the haptic loop when it misses no more than five ticks in a thousand. Where one does not, or holds it only by drawing less, it is said which
-//! knob would save most (by measured fronts, down to `draft`) and which effect costs most there.
+//! knob would save most (by measured fronts, down to `draft`) and which effect costs most there. A tick or frame of which none ended in what is counted
+//! takes longer than that: its times are this least, and the loop does not hold. (Steps are made when there is something to do: none is none.)
 
 use maille_governor::{FrontPoint, time_at};
 use maille_scene::{
@@ -68,6 +69,10 @@ pub struct LoopCost {
     pub coarse_share: f64,
     /// its stages
     pub stages: Vec<StageCost>,
+    /// stages of its plan that nothing called for in this time
+    pub unreached: Vec<&'static str>,
+    /// it turns all the time, and no turn ended in what is counted: its times are how long that was
+    pub unended: bool,
 }
 
 impl LoopCost {
@@ -103,7 +108,7 @@ pub fn rehearse(scene: &Scene, plan: &Plan, way: Option<&Waypoints>, fronts: &Fr
     let seconds = WARM_UP_S + counted;
     let load_1m = fs::read_to_string("/proc/loadavg").ok().and_then(|t| t.split(' ').next()?.parse().ok()).unwrap_or(0.0);
     let report = run(&scene, seconds)?;
-    let loops: Vec<LoopCost> = plan.processes.iter().filter_map(|p| cost(&report, plan, p.process, p.rate_hz?)).collect();
+    let loops: Vec<LoopCost> = plan.processes.iter().filter_map(|p| cost(&report, plan, p.process, p.rate_hz?, counted)).collect();
     let advice = loops.iter().filter_map(|l| advice(l, &scene, plan, fronts)).collect();
     Ok(Costs { seconds, load_1m, loops, advice })
 }
@@ -170,7 +175,7 @@ fn run(scene: &Scene, seconds: f64) -> Result<Value, String> {
     serde_json::from_str(&text).map_err(|e| failed("its report", &e))
 }
 
-fn cost(report: &Value, plan: &Plan, process: Process, asked_hz: f64) -> Option<LoopCost> {
+fn cost(report: &Value, plan: &Plan, process: Process, asked_hz: f64, counted_s: f64) -> Option<LoopCost> {
     let own = &report["services"][process.service()];
     let n = |path: &str| own.pointer(path).and_then(Value::as_f64).unwrap_or(0.0);
     let (turn, key, us) = match process {
@@ -179,13 +184,14 @@ fn cost(report: &Value, plan: &Plan, process: Process, asked_hz: f64) -> Option<
         Process::Rendering => (Per::Frame, "/frame_ms", 1e3),
         Process::Console => return None,
     };
-    let (p50_us, p99_us) = (us * n(&format!("{key}/p50")), us * n(&format!("{key}/p99")));
+    let unended = turn != Per::Step && n(&format!("{key}/p50")) == 0.0;
+    let [p50_us, p99_us] = ["p50", "p99"].map(|q| if unended { 1e6 * counted_s } else { us * n(&format!("{key}/{q}")) });
     let period_us = 1e6 / asked_hz;
     let timed = || own["stages"].as_array().into_iter().flatten();
     let count = timed().filter_map(|s| s["count"].as_f64()).fold(0.0, f64::max);
     let mean_us = timed().filter_map(|s| Some(s["us"].as_f64()? * s["count"].as_f64()?)).sum::<f64>() / count.max(1.0);
     let (rate_hz, holds) = match process {
-        Process::Haptic => (n("/rate_hz"), n("/overruns") <= MISSED * (n("/ticks") + n("/overruns"))),
+        Process::Haptic => (n("/rate_hz"), !unended && n("/overruns") <= MISSED * (n("/ticks") + n("/overruns"))),
         // a queue that grows by some long turns does not hold, however short the others
         _ => (asked_hz.min(if p50_us > 0.0 { 1e6 / p50_us } else { asked_hz }), p50_us.max(mean_us) <= period_us),
     };
@@ -195,18 +201,30 @@ fn cost(report: &Value, plan: &Plan, process: Process, asked_hz: f64) -> Option<
         let name = s["name"].as_str()?;
         Some(StageCost { name: name.to_owned(), effect: owner(name), us: s["us"].as_f64()? })
     });
+    let stages: Vec<StageCost> = stages.collect();
+    let planned = plan.processes.iter().filter(|p| p.process == process).flat_map(|p| &p.stages).map(|s| s.name);
+    let unreached = planned.filter(|name| stages.iter().all(|s| s.name != *name)).collect();
     let coarse_share = n("/coarse_frames") / n("/frames").max(1.0);
-    Some(LoopCost { process, turn, p50_us, p99_us, mean_us, period_us, rate_hz, holds, coarse_share, stages: stages.collect() })
+    Some(LoopCost { process, turn, p50_us, p99_us, mean_us, period_us, rate_hz, holds, coarse_share, stages, unreached, unended })
 }
 
 /// What to do about a loop that does not hold its rate, or only by drawing less.
 fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<String> {
     let rate = 1e6 / l.period_us;
     let service = l.process.service();
+    // nothing moves there by itself: a picture that stands was drawn again and again only to be timed
+    let still = l.process == Process::Rendering && plan.processes.len() == 1 && !scene.has_effect("breathing");
     let trouble = match l.process {
-        _ if l.p50_us == 0.0 => return None,
-        // nothing moves there by itself: a picture that stands was drawn again and again only to be timed
-        Process::Rendering if plan.processes.len() == 1 && !scene.has_effect("breathing") => return None,
+        _ if l.unended => format!("{service} will not hold its {rate:.0} Hz: no {} ended in {:.0} s", l.turn.name(), 1e-6 * l.p50_us),
+        _ if !l.holds && still => format!(
+            "a picture that stands is not drawn again, but if anything moved, rendering would draw {:.1} a second of its {rate:.0} (a frame takes {}, and \
+             there are {})",
+            l.rate_hz,
+            time(l.p50_us),
+            time(l.period_us)
+        ),
+        // a picture that is drawn once may as well be whole
+        Process::Rendering if still => return None,
         Process::Haptic if !l.holds => format!("haptic will miss ticks: {:.1} of {rate:.0} a second were made", l.rate_hz),
         _ if !l.holds => format!(
             "{service} will not hold its {rate:.0} Hz: a {} takes {}{}, and there are {}",
@@ -237,20 +255,17 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
             }
             let points: Vec<FrontPoint> = fronts.of(knob.name)?;
             let ratio = time_at(&points, knob.defaults[0])? / time_at(&points, *value)?;
-            let part = if eased == l.process { l.stages.iter().find(|s| s.name == stage)?.us / l.p50_us } else { 1.0 };
+            let part = if eased == l.process && !l.unended { l.stages.iter().find(|s| s.name == stage)?.us / l.p50_us } else { 1.0 };
             let saves = 1.0 - part.min(1.0) * (1.0 - ratio);
             (saves < WORTH).then(|| (saves, format!("`{}` = {} ({:.0} % of the time)", knob.name, knob.defaults[0], 100.0 * saves)))
         })
         .collect();
     knobs.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let mut stages: Vec<&StageCost> = l
-        .stages
-        .iter()
-        .filter(|s| {
-            let switchable = plan.effects.iter().any(|e| e.name == s.effect && e.called_by == CalledBy::Effects);
-            switchable && scene.effects.get(s.effect).is_some_and(EffectSetting::is_on) && s.us > 0.05 * l.p50_us
-        })
-        .collect();
+    let switchable = |effect: &str| {
+        let by_name = plan.effects.iter().any(|e| e.name == effect && e.called_by == CalledBy::Effects);
+        by_name && scene.effects.get(effect).is_some_and(EffectSetting::is_on)
+    };
+    let mut stages: Vec<&StageCost> = l.stages.iter().filter(|s| switchable(s.effect) && s.us > 0.05 * l.p50_us).collect();
     stages.sort_by(|a, b| b.us.total_cmp(&a.us));
     let mut ways: Vec<String> = knobs.into_iter().take(2).map(|(_, text)| format!("turn {text}")).collect();
     ways.extend(stages.first().map(|s| {
@@ -258,6 +273,10 @@ fn advice(l: &LoopCost, scene: &Scene, plan: &Plan, fronts: &Fronts) -> Option<S
         let others = plan.effects.iter().filter(|e| e.depends_on.contains(&s.effect)).map(|e| format!(" and `{}`", e.name));
         format!("switch off `{}`{} ({} a {})", s.effect, others.collect::<String>(), time(s.us), l.turn.name())
     }));
+    // where nothing was timed nobody knows which of them it is
+    let has_stage = |e: &&&maille_scene::Effect| e.stages.iter().any(|s| s.process == l.process);
+    let untimed = plan.effects.iter().filter(|e| l.unended && switchable(e.name)).filter(has_stage);
+    ways.extend(untimed.map(|e| format!("switch off `{}`", e.name)));
     ways.push(match l.process {
         Process::Haptic => "leave a core to it".to_owned(),
         _ => format!("ask for less than {rate:.0} Hz (`{service}.rate_hz`)"),
@@ -282,11 +301,13 @@ impl Costs {
             vec![format!("measured here in {:.0} s of this scene, load {:.1} (--no-measure leaves it out)", self.seconds, self.load_1m)];
         out.push(format!("  {:<12} {:<6} {:>8} {:>8} {:>8} {:>9}  stages, mean", "loop", "turn", "p50", "p99", "period", "headroom"));
         for l in &self.loops {
-            if l.p50_us == 0.0 {
-                out.push(format!("  {:<12} {:<6} none in this time", l.process.service(), l.turn.name()));
+            if l.p50_us == 0.0 || l.unended {
+                let none = if l.unended { "none ended" } else { "none" };
+                out.push(format!("  {:<12} {:<6} {none} in this time", l.process.service(), l.turn.name()));
                 continue;
             }
-            let stages: Vec<String> = l.stages.iter().map(|s| format!("{} {}", s.name, time(s.us))).collect();
+            let mut stages: Vec<String> = l.stages.iter().map(|s| format!("{} {}", s.name, time(s.us))).collect();
+            stages.extend(l.unreached.iter().map(|name| format!("{name} not reached in this time")));
             out.push(format!(
                 "  {:<12} {:<6} {:>8} {:>8} {:>8} {:>7.0} %  {}",
                 l.process.service(),
@@ -316,6 +337,7 @@ impl Costs {
         let one = |l: &LoopCost| {
             json!({ "service": l.process.service(), "turn": l.turn.name(), "p50_us": l.p50_us, "p99_us": l.p99_us, "period_us": l.period_us,
                     "mean_us": l.mean_us, "headroom": l.headroom(), "rate_hz": l.rate_hz, "holds": l.holds, "coarse_share": l.coarse_share,
+                    "unended": l.unended, "unreached": l.unreached,
                     "stages": l.stages.iter().map(stage).collect::<Vec<_>>() })
         };
         json!({ "seconds": self.seconds, "load_1m": self.load_1m, "loops": self.loops.iter().map(one).collect::<Vec<_>>(), "advice": self.advice })
@@ -329,13 +351,16 @@ mod tests {
     use maille_volume::Grid;
 
     fn told(rendering: Value) -> Costs {
-        let scene = Scene::builtin_default();
+        told_of(Scene::builtin_default(), rendering)
+    }
+
+    fn told_of(scene: Scene, rendering: Value) -> Costs {
         let plan = plan(&scene, &Grid::axis_aligned([64; 3], [1.0; 3]), Machine { cores: 2 });
         let report = json!({ "services": {
             "haptic": { "tick_us": { "p50": 10.0, "p99": 30.0 }, "ticks": 3000, "overruns": 0, "rate_hz": 1000.0,
                         "stages": [{ "name": "contact", "count": 3000, "us": 8.0 }] },
             "rendering": rendering } });
-        let loops: Vec<LoopCost> = plan.processes.iter().filter_map(|p| cost(&report, &plan, p.process, p.rate_hz?)).collect();
+        let loops: Vec<LoopCost> = plan.processes.iter().filter_map(|p| cost(&report, &plan, p.process, p.rate_hz?, 2.0)).collect();
         let fronts = Fronts::open(None).unwrap();
         let advice = loops.iter().filter_map(|l| advice(l, &scene, &plan, &fronts)).collect();
         Costs { seconds: 3.0, load_1m: 0.0, loops, advice }
@@ -359,6 +384,38 @@ mod tests {
         assert!(told(json!({ "frame_ms": { "p50": 20.0, "p99": 30.0 }, "frames": 100 })).advice.is_empty());
         let less = told(json!({ "frame_ms": { "p50": 27.0, "p99": 30.0 }, "frames": 100, "coarse_frames": 60 }));
         assert!(less.advice[0].contains("drawing 60 % of the frames"), "{:?}", less.advice);
+    }
+
+    #[test]
+    fn a_loop_of_which_no_turn_ended_is_late_and_not_in_time() {
+        let costs = told(json!({ "frame_ms": { "p50": 0.0, "p99": 0.0 }, "frames": 0 }));
+        let rendering = costs.loops.last().unwrap();
+        assert!(!rendering.holds && rendering.unended && rendering.headroom() < -50.0 && rendering.rate_hz <= 0.5, "{}", costs.to_json());
+        let [advice] = &costs.advice[..] else { panic!("{:?}", costs.advice) };
+        for word in ["will not hold its 30 Hz", "no frame ended in 2 s", "`rendering.scale`", "ask for less than 30 Hz"] {
+            assert!(advice.contains(word), "{word} is not in {advice}");
+        }
+        let text = costs.lines().join("\n");
+        assert!(text.contains("none ended in this time") && !text.contains("hold their rates"), "{text}");
+        // steps are made when there is something to do
+        let deformation = &costs.loops[0];
+        assert!(deformation.unreached.contains(&"chainmail") && !costs.loops[1].unreached.contains(&"contact"));
+        assert!(text.contains("tool moves not reached in this time"), "{text}");
+        assert!(deformation.turn == Per::Step && deformation.holds && !deformation.unended && deformation.p50_us == 0.0);
+    }
+
+    #[test]
+    fn a_scene_where_nothing_moves_is_told_what_it_would_be_if_it_did() {
+        let text = "name = \"still\"\n[console]\nenabled = false\n[rendering]\nrate_hz = 240\n[effects]\nsections = true\n";
+        let still = || Scene::parse("still", text).unwrap();
+        let stages = json!([{ "name": "ray casting", "count": 40, "us": 45_000.0 }]);
+        let costs = told_of(still(), json!({ "frame_ms": { "p50": 50.0, "p99": 60.0 }, "frames": 40, "stages": stages }));
+        let [advice] = &costs.advice[..] else { panic!("one process, that is late: {:?}", costs.advice) };
+        for word in ["a picture that stands is not drawn again", "20.0 a second of its 240", "50 ms", "4.2 ms", "`rendering.scale`"] {
+            assert!(advice.contains(word), "{word} is not in {advice}");
+        }
+        assert!(!costs.lines().join(" ").contains("hold their rates") && !costs.loops[0].holds);
+        assert!(told_of(still(), json!({ "frame_ms": { "p50": 3.0, "p99": 4.0 }, "frames": 400 })).advice.is_empty());
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Hard cases of breathing: signals and the way between world and rest.
 
 use crate::{
-    Case, Digest, Invariant, Seen, at_most, hard_cases,
+    Case, Deed, Digest, Invariant, Seen, at_least, at_most, hard_cases,
     made::{BAD, Random, volume},
 };
 use maille_motion::{
@@ -32,14 +32,25 @@ const RETURNS: &[Invariant] = &[
     at_most("field evaluations a point", "", 64.0),
 ];
 
+/// Breath goes from one end of its usual depth to the other.
+const BREATHED: &[Deed] =
+    &[at_least("from the lowest level seen to the highest", "1", 0.7), at_least("states that go up or down", "", 4000.0)];
+
+/// Tissue is carried, and its way back is found.
+const CARRIED: &[Deed] = &[at_least("ways back that were found", "", 1000.0), at_least("farthest that tissue was carried", "mm", 10.0)];
+const CARRIED_AROUND: &[Deed] = &[at_least("ways back that were found", "", 60.0), at_least("farthest that tissue was carried", "mm", 5.0)];
+
 struct Flow {
     worst: [f64; 3],
+    /// lowest and highest level
+    range: [f64; 2],
+    moving: usize,
     digest: Digest,
 }
 
 impl Flow {
     fn new() -> Self {
-        Self { worst: [0.0; 3], digest: Digest::new() }
+        Self { worst: [0.0; 3], range: [f64::INFINITY, f64::NEG_INFINITY], moving: 0, digest: Digest::new() }
     }
 
     /// Looks every 2 ms from a time on, and asks a second process for the same in another order.
@@ -49,7 +60,9 @@ impl Flow {
         for pair in states.windows(2) {
             self.worst[0] = self.worst[0].max((pair[1].1.level - pair[0].1.level).abs() / 2.0);
         }
+        self.moving += states.windows(2).filter(|pair| pair[0].1.level != pair[1].1.level).count();
         for (time, state) in states.iter().rev() {
+            self.range = [self.range[0].min(state.level), self.range[1].max(state.level)];
             let again = other.at(*time);
             let bits = |b: &Breath| [b.level, b.rate, b.phase].map(f64::to_bits);
             self.worst[2] += f64::from(u8::from(bits(state) != bits(&again)));
@@ -59,7 +72,8 @@ impl Flow {
     }
 
     fn seen(self) -> Seen {
-        Seen { worst: self.worst.to_vec(), digest: self.digest.value() }
+        let did = vec![self.range[1] - self.range[0], self.moving as f64];
+        Seen { worst: self.worst.to_vec(), did, digest: self.digest.value() }
     }
 }
 
@@ -124,11 +138,12 @@ struct Return {
     worst: [f64; 3],
     digest: Digest,
     found: usize,
+    carried: f64,
 }
 
 impl Return {
     fn new() -> Self {
-        Self { worst: [0.0; 3], digest: Digest::new(), found: 0 }
+        Self { worst: [0.0; 3], digest: Digest::new(), found: 0, carried: 0.0 }
     }
 
     fn go(&mut self, at: &MotionAt<'_>, world: [f64; 3], guess: [f64; 3]) {
@@ -141,14 +156,14 @@ impl Return {
         if found.converged {
             self.found += 1;
             let back = at.to_world(found.reference);
+            self.carried = (0..3).map(|c| (world[c] - found.reference[c]).abs()).fold(self.carried, f64::max);
             let residual = (0..3).map(|c| (world[c] - back[c]).abs()).fold(0.0, f64::max);
             self.worst[0] = if residual <= self.worst[0] { self.worst[0] } else { residual };
         }
     }
 
-    fn seen(self, least: usize) -> Seen {
-        assert!(self.found >= least, "{} answers: too few to say anything", self.found);
-        Seen { worst: self.worst.to_vec(), digest: self.digest.value() }
+    fn seen(self) -> Seen {
+        Seen { worst: self.worst.to_vec(), did: vec![self.found as f64, self.carried], digest: self.digest.value() }
     }
 }
 
@@ -179,7 +194,7 @@ fn folded_tissue() -> Seen {
             }
         }
     }
-    back.seen(1000)
+    back.seen()
 }
 
 fn beyond_the_grid() -> Seen {
@@ -204,19 +219,19 @@ fn beyond_the_grid() -> Seen {
             }
         }
     }
-    back.seen(60)
+    back.seen()
 }
 
-const fn case(name: &'static str, invariants: &'static [Invariant], run: fn() -> Seen) -> Case {
-    Case { engine: "breathing", name, effects: &["breathing"], invariants, run }
+const fn case(name: &'static str, invariants: &'static [Invariant], deeds: &'static [Deed], run: fn() -> Seen) -> Case {
+    Case { engine: "breathing", name, effects: &["breathing"], invariants, deeds, run }
 }
 
 pub(crate) const CASES: &[Case] = &[
-    case("a trace with holes", FLOWS, a_trace_with_holes),
-    case("folded tissue", RETURNS, folded_tissue),
-    case("beyond the model's grid", RETURNS, beyond_the_grid),
-    case("breath held and slid", LED, held_and_slid),
-    case("restart in mid-breath", FLOWS, restart_in_mid_breath),
+    case("a trace with holes", FLOWS, BREATHED, a_trace_with_holes),
+    case("folded tissue", RETURNS, CARRIED, folded_tissue),
+    case("beyond the model's grid", RETURNS, CARRIED_AROUND, beyond_the_grid),
+    case("breath held and slid", LED, BREATHED, held_and_slid),
+    case("restart in mid-breath", FLOWS, BREATHED, restart_in_mid_breath),
 ];
 
 hard_cases! {

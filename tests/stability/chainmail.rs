@@ -1,12 +1,12 @@
 //! Hard cases of ChainMail and the mapper.
 
 use crate::{
-    Case, Digest, Invariant, Seen, at_most, hard_cases,
+    Case, Deed, Digest, Invariant, Seen, at_least, at_most, hard_cases,
     made::{BAD, Random, volume, voxels},
 };
 use maille_chainmail::{
-    Capsule, ChainMail, LinkModel, Metric, Motion, Pin, PlasticBand, RelaxOptions, Slender, Tissue, elements_in_sphere, enclosing_elements,
-    swept_blade,
+    Capsule, ChainMail, ChangedRegion, LinkModel, Metric, Motion, Pin, PlasticBand, PushOutcome, RelaxOptions, Relaxed, Slender, Tissue,
+    elements_in_sphere, enclosing_elements, swept_blade,
 };
 use maille_mapper::{MapOptions, Mapper};
 use maille_volume::{BrickSource, BrickedVolume};
@@ -40,6 +40,34 @@ const HOLDS_AND_RESUMES: &[Invariant] = &[
     at_most("elements that differ after a restart", "", 0.0),
 ];
 
+/// The same, and that what was carried by whole voxels is seen where it was carried to.
+const HOLDS_AND_CARRIES: &[Invariant] = &[
+    at_most("link beyond 1.001 of its limit", "mm", 1e-6),
+    at_most("element beyond its movement limit", "mm", 1e-6),
+    at_most("bone moved", "mm", 0.0),
+    at_most("displacements not finite", "", 0.0),
+    at_most("mapped value outside the rest's range", "HU", 0.0),
+    // values differ by up to 2800 HU from voxel to voxel, and a position is found within a thousandth of one
+    at_most("mapped value away from the one that was carried there", "HU", 10.0),
+];
+
+/// What each case did at least: pushes that moved what they pinned, elements that lay elsewhere when it was looked at, voxels that were rewritten, links
+/// that were cut, elements that went back by themselves.
+const fn did(pushes: f64, elements: f64, voxels: f64, links: f64, relaxed: f64) -> [Deed; 5] {
+    [
+        at_least("pushes that moved what they pinned", "", pushes),
+        at_least("elements that lay elsewhere", "", elements),
+        at_least("voxels that were rewritten", "", voxels),
+        at_least("links that were cut", "", links),
+        at_least("elements that relaxation moved", "", relaxed),
+    ]
+}
+
+/// The same, with something more that is asked of it.
+const fn did_and(what: &'static str, least: f64, [a, b, c, d, e]: [Deed; 5]) -> [Deed; 6] {
+    [a, b, c, d, e, at_least(what, "", least)]
+}
+
 /// A patient, what is done to it, and the worst that was seen.
 struct Bench {
     rest: BrickedVolume,
@@ -48,6 +76,8 @@ struct Bench {
     deformed: BrickedVolume,
     random: Random,
     worst: [f64; 5],
+    /// as [`did`] has them
+    did: [f64; 5],
     digest: Digest,
 }
 
@@ -61,6 +91,7 @@ impl Bench {
             random: Random(7),
             // what is left to a limit is shown, too: as what is below 0
             worst: [f64::NEG_INFINITY, f64::NEG_INFINITY, 0.0, 0.0, 0.0],
+            did: [0.0; 5],
             digest: Digest::new(),
         }
     }
@@ -77,10 +108,38 @@ impl Bench {
     }
 
     fn push(&mut self, pins: &[Pin]) {
-        let outcome = self.mail.push(&self.rest, pins);
+        let outcome = self.push_unmapped(pins);
         let said = outcome.admitted.iter().chain(&outcome.refused_mm);
         self.worst[3] += said.filter(|v| !v.is_finite()).count() as f64;
         self.map(&outcome.region);
+    }
+
+    /// A push that nobody looks at; whether it did anything is asked of the elements, not of what it says.
+    fn push_unmapped(&mut self, pins: &[Pin]) -> PushOutcome {
+        let size = self.size();
+        let inside = |pin: &&Pin| (0..3).all(|c| pin.voxel[c] < size[c]);
+        let before: Vec<[f32; 3]> = pins.iter().filter(inside).map(|pin| self.mail.displacement(pin.voxel)).collect();
+        let outcome = self.mail.push(&self.rest, pins);
+        let moved = pins.iter().filter(inside).zip(before).any(|(pin, before)| self.mail.displacement(pin.voxel) != before);
+        self.did[0] += f64::from(u8::from(moved));
+        outcome
+    }
+
+    fn relax(&mut self, options: &RelaxOptions, tools: &[Capsule], stop: &dyn Fn() -> bool) -> Relaxed {
+        let relaxed = self.mail.relax_elastic(&self.rest, options, tools, stop);
+        self.did[4] += relaxed.moved as f64;
+        relaxed
+    }
+
+    /// Cuts, and counts links that are cut and were not.
+    fn cut(&mut self, with: impl FnOnce(&mut ChainMail, &BrickedVolume) -> ChangedRegion) -> ChangedRegion {
+        let links = |mail: &ChainMail| {
+            voxels(mail.layout().size).flat_map(|v| (0..3).map(move |axis| (v, axis))).filter(|&(v, axis)| mail.is_cut(v, axis)).count()
+        };
+        let before = links(&self.mail);
+        let region = with(&mut self.mail, &self.rest);
+        self.did[3] += links(&self.mail) as f64 - before as f64;
+        region
     }
 
     /// A push of random place and size.
@@ -93,7 +152,7 @@ impl Bench {
         self.push(&pins);
     }
 
-    fn map(&mut self, region: &maille_chainmail::ChangedRegion) {
+    fn map(&mut self, region: &ChangedRegion) {
         self.mapper.remap(&self.rest, &self.mail, region, &mut self.deformed, &MapOptions::default());
     }
 
@@ -103,10 +162,12 @@ impl Bench {
         let infinite = |u: [f32; 3]| u.iter().filter(|v| !v.is_finite()).count() as f64;
         let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
         let mut deformed: Vec<f64> = Vec::new();
+        let (mut elsewhere, mut rewritten) = (0, 0);
         for v in voxels(size) {
             let u = self.mail.displacement(v);
             self.worst[3] += infinite(u);
             self.digest.floats(u.map(f64::from));
+            elsewhere += usize::from(u.iter().any(|c| c.abs() > 0.01));
             let (_, bound) = self.mail.limits(&self.rest, v);
             for c in u {
                 let over = f64::from(c.abs()) - 1.001 * f64::from(bound);
@@ -131,7 +192,11 @@ impl Bench {
             let value = f64::from(self.rest.voxel(v[0], v[1], v[2]));
             (low, high) = (low.min(value), high.max(value));
             deformed.push(f64::from(self.deformed.voxel(v[0], v[1], v[2])));
+            rewritten += usize::from(deformed.last() != Some(&value));
         }
+        // most of each that was ever seen
+        self.did[1] = self.did[1].max(elsewhere as f64);
+        self.did[2] = self.did[2].max(rewritten as f64);
         // where tissue leaves a gap there is air
         low = low.min(MapOptions::default().void_hu);
         for value in deformed {
@@ -141,7 +206,14 @@ impl Bench {
     }
 
     fn seen(self, more: &[f64]) -> Seen {
-        Seen { worst: self.worst.iter().chain(more).copied().collect(), digest: self.digest.value() }
+        Seen { worst: self.worst.iter().chain(more).copied().collect(), did: self.did.to_vec(), digest: self.digest.value() }
+    }
+
+    /// The same, with one more deed.
+    fn seen_and(self, more: &[f64], deed: f64) -> Seen {
+        let mut seen = self.seen(more);
+        seen.did.push(deed);
+        seen
     }
 
     /// Largest displacement [mm].
@@ -187,11 +259,11 @@ fn mixed(spacing: [f64; 3]) -> BrickedVolume {
     volume(SIZE, spacing, |[i, j, k]| if (i / 4 + j / 5 + k / 3).is_multiple_of(11) { 2500.0 } else { random.within(-900.0, 1900.0) })
 }
 
-/// One soft material around a ball of bone.
+/// One soft material, told apart voxel by voxel by a few HU, around a ball of bone.
 fn ball_of_bone() -> BrickedVolume {
     volume(SIZE, [1.0, 1.2, 1.5], |[i, j, k]| {
         let d = [i as f64 - 13.0, j as f64 - 11.0, k as f64 - 9.0];
-        if d.iter().map(|v| v * v).sum::<f64>() < 16.0 { 2500.0 } else { 40.0 }
+        if d.iter().map(|v| v * v).sum::<f64>() < 16.0 { 2500.0 } else { 40.0 + ((7 * i + 5 * j + 3 * k) % 9) as f64 }
     })
 }
 
@@ -236,7 +308,7 @@ fn spacing_one_to_ten() -> Seen {
 }
 
 fn offsets_from_a_hundredth_to_nearly_one() -> Seen {
-    let mut worst = [f64::NEG_INFINITY; 5];
+    let (mut worst, mut did) = ([f64::NEG_INFINITY; 5], [f64::INFINITY; 5]);
     let mut digest = Digest::new();
     for offset in [0.01, 0.1, 0.2, 0.33, 0.5, 0.99] {
         let mut bench = Bench::new(ball_of_bone(), tissue(offset));
@@ -245,9 +317,11 @@ fn offsets_from_a_hundredth_to_nearly_one() -> Seen {
         }
         bench.look();
         (0..5).for_each(|n| worst[n] = worst[n].max(bench.worst[n]));
+        // of the offset that did least
+        (0..5).for_each(|n| did[n] = did[n].min(bench.did[n]));
         digest.add(bench.digest.value());
     }
-    Seen { worst: worst.to_vec(), digest: digest.value() }
+    Seen { worst: worst.to_vec(), did: did.to_vec(), digest: digest.value() }
 }
 
 fn back_and_forth() -> Seen {
@@ -257,14 +331,14 @@ fn back_and_forth() -> Seen {
     for n in 0..50_000 {
         // there and back by amounts that floats cannot hold exactly
         let by = 0.1 + 0.3 * (n % 7) as f32 / 7.0;
-        bench.mail.push(&bench.rest, &pin(by));
-        bench.mail.push(&bench.rest, &pin(-by));
+        bench.push_unmapped(&pin(by));
+        bench.push_unmapped(&pin(-by));
     }
     bench.map(&bench.mail.displaced_region());
     bench.look();
     let options = RelaxOptions { sweeps: 64, ..RelaxOptions::default() };
     for _ in 0..200 {
-        if bench.mail.relax_elastic(&bench.rest, &options, &[], &|| false).settled {
+        if bench.relax(&options, &[], &|| false).settled {
             break;
         }
     }
@@ -320,13 +394,39 @@ fn bad_moves() -> Seen {
     bench.seen(&[])
 }
 
+/// Nothing moves; the same pushes move the same voxels where they count as soft.
 fn all_bone() -> Seen {
-    let mut bench = Bench::new(volume(SIZE, [1.0; 3], |_| 2600.0), tissue(0.3));
-    for _ in 0..10 {
-        bench.push_anywhere(5.0);
-    }
+    let [bone, soft] = [Some(BONE), None].map(|bone_hu| {
+        let mut bench = Bench::new(volume(SIZE, [1.0; 3], |[i, ..]| 2600.0 + (i % 2) as f64), Tissue { bone_hu, ..tissue(0.3) });
+        for _ in 0..10 {
+            bench.push_anywhere(5.0);
+        }
+        bench.look();
+        bench
+    });
+    let digest = bone.digest.value();
+    Seen { worst: bone.worst.to_vec(), did: soft.did.to_vec(), digest }
+}
+
+/// A block of elements goes by whole voxels, and with it what lies in it.
+fn a_block_carried_by_whole_voxels() -> Seen {
+    let rest = volume(SIZE, [1.0; 3], |[i, j, k]| (((i * 7 + j * 11 + k * 13) % 29) as f64) * 50.0 - 700.0);
+    let mut bench = Bench::new(rest, Tissue { bone_hu: None, movement_limit_mm: None, ..tissue(0.99) });
+    let (low, high, by) = ([9, 8, 7], [17, 14, 12], [3, -2, 1]);
+    let block = |margin: usize| voxels(SIZE).filter(move |v| (0..3).all(|c| (low[c] + margin..=high[c] - margin).contains(&v[c])));
+    let motion = Motion::By(by.map(|v| v as f32));
+    let pins: Vec<Pin> = block(0).map(|voxel| Pin { voxel, motion }).collect();
+    bench.push(&pins);
     bench.look();
-    bench.seen(&[])
+    // a voxel within the block, where all around it goes the same way
+    let (mut away, mut carried) = (0.0f64, 0);
+    for v in block(1) {
+        let to = [0, 1, 2].map(|c| v[c].wrapping_add_signed(by[c]));
+        let [was, is] = [bench.rest.voxel(v[0], v[1], v[2]), bench.deformed.voxel(to[0], to[1], to[2])].map(f64::from);
+        away = away.max((was - is).abs());
+        carried += usize::from(is != f64::from(bench.rest.voxel(to[0], to[1], to[2])));
+    }
+    bench.seen_and(&[away], carried as f64)
 }
 
 fn two_tools() -> Seen {
@@ -348,9 +448,10 @@ fn links_of_any_stiffness() -> Seen {
     for _ in 0..12 {
         bench.push_anywhere(3.0);
     }
+    bench.look();
     let options = RelaxOptions { sweeps: 200, ..RelaxOptions::default() };
     for _ in 0..400 {
-        let relaxed = bench.mail.relax_elastic(&bench.rest, &options, &[], &|| false);
+        let relaxed = bench.relax(&options, &[], &|| false);
         bench.map(&relaxed.region);
         if relaxed.settled {
             break;
@@ -373,7 +474,7 @@ fn a_push_in_the_middle_of_relaxation() -> Seen {
             asked.get() > n % 5
         };
         let options = RelaxOptions { tools_hold_hu: Some(-500.0), ..RelaxOptions::default() };
-        let relaxed = bench.mail.relax_elastic(&bench.rest, &options, &[tool], &stop);
+        let relaxed = bench.relax(&options, &[tool], &stop);
         bench.map(&relaxed.region);
         if n % 5 == 4 {
             bench.look();
@@ -389,7 +490,7 @@ fn restart_half_way() -> Seen {
         bench.push_anywhere(3.0);
     }
     let blade = swept_blade([[4.0, 10.0, 9.0], [20.0, 10.0, 9.0]], [[4.0, 10.0, 14.0], [20.0, 10.0, 14.0]]);
-    let cut = bench.mail.cut_triangles(&bench.rest, &blade);
+    let cut = bench.cut(|mail, rest| mail.cut_triangles(rest, &blade));
     bench.map(&cut);
     let differ = bench.differs_after_restart(|mail, rest| {
         let relaxed = mail.relax_elastic(rest, &RelaxOptions { sweeps: 3, ..RelaxOptions::default() }, &[], &|| false);
@@ -397,7 +498,8 @@ fn restart_half_way() -> Seen {
         mail.push(rest, &[Pin { voxel: [12, 11, 10], motion: Motion::By([0.7, -1.1, 2.0]) }]);
         mail.relax(0.5, 1e-3);
     });
-    bench.map(&bench.mail.displaced_region());
+    let relaxed = bench.relax(&RelaxOptions { sweeps: 3, ..RelaxOptions::default() }, &[], &|| false);
+    bench.map(&relaxed.region);
     bench.look();
     bench.seen(&[differ])
 }
@@ -407,14 +509,16 @@ fn plastic_back_and_forth() -> Seen {
     bench.mail.set_plasticity(BANDS.to_vec());
     for n in 0..400 {
         let by = if n % 2 == 0 { 1.3 } else { -1.3 };
-        bench.mail.push(&bench.rest, &[Pin { voxel: [12, 11, 9], motion: Motion::By([by, 0.3 * by, -by]) }]);
+        bench.push_unmapped(&[Pin { voxel: [12, 11, 9], motion: Motion::By([by, 0.3 * by, -by]) }]);
         if n % 40 == 39 {
-            bench.mail.relax_elastic(&bench.rest, &RelaxOptions::default(), &[], &|| false);
+            bench.relax(&RelaxOptions::default(), &[], &|| false);
         }
     }
     bench.map(&bench.mail.displaced_region());
     bench.look();
-    bench.seen(&[])
+    let stays = |id: &u32| bench.mail.plastic_brick(*id).is_some_and(|plastic| plastic.u.iter().any(|c| c.iter().any(|v| v.abs() > 0.01)));
+    let bricks = (0..bench.rest.layout().count() as u32).filter(stays).count();
+    bench.seen_and(&[], bricks as f64)
 }
 
 fn with_shape(rest: BrickedVolume) -> Bench {
@@ -425,15 +529,17 @@ fn with_shape(rest: BrickedVolume) -> Bench {
 
 fn threshold_changed() -> Seen {
     let mut bench = with_shape(mixed([1.0; 3]));
+    let mut changed = 0;
     for threshold in [-300.0, 200.0, -900.0, 1200.0, -2000.0, 3000.0, 0.0] {
         for _ in 0..3 {
             bench.push_anywhere(3.0);
         }
         let region = bench.mail.set_threshold(&bench.rest, Some(threshold));
+        changed += usize::from(!region.is_empty());
         bench.map(&region);
         bench.look();
     }
-    bench.seen(&[])
+    bench.seen_and(&[], changed as f64)
 }
 
 fn thin_walls() -> Seen {
@@ -477,7 +583,7 @@ fn a_blade_that_jumps() -> Seen {
     for (n, bad) in BAD.into_iter().chain([4.0, 12.0, 20.0]).enumerate() {
         let mut place = corners;
         place[n % 4][n % 3] = bad;
-        let region = bench.mail.cut_triangles(&bench.rest, &swept_blade([place[0], place[1]], [place[2], place[3]]));
+        let region = bench.cut(|mail, rest| mail.cut_triangles(rest, &swept_blade([place[0], place[1]], [place[2], place[3]])));
         bench.map(&region);
         bench.push_anywhere(4.0);
     }
@@ -489,7 +595,7 @@ fn cut_again_where_it_was_cut() -> Seen {
     let mut bench = Bench::new(mixed([1.0; 3]), tissue(0.3));
     let blade = swept_blade([[4.0, 11.3, 4.0], [22.0, 11.3, 4.0]], [[4.0, 11.3, 25.0], [22.0, 11.3, 25.0]]);
     for n in 0..6 {
-        let region = bench.mail.cut_triangles(&bench.rest, &blade);
+        let region = bench.cut(|mail, rest| mail.cut_triangles(rest, &blade));
         bench.map(&region);
         // only the first cuts anything
         bench.worst[3] += f64::from(u8::from(n > 0 && !region.is_empty()));
@@ -516,31 +622,62 @@ fn round_metric() -> Seen {
     bench.seen(&[])
 }
 
-const fn case(name: &'static str, effects: &'static [&'static str], invariants: &'static [Invariant], run: fn() -> Seen) -> Case {
-    Case { engine: "ChainMail", name, effects, invariants, run }
+const fn case(
+    name: &'static str,
+    effects: &'static [&'static str],
+    invariants: &'static [Invariant],
+    deeds: &'static [Deed],
+    run: fn() -> Seen,
+) -> Case {
+    Case { engine: "ChainMail", name, effects, invariants, deeds, run }
 }
 
 pub(crate) const CASES: &[Case] = &[
-    case("stiff beside soft", &["deformation"], HOLDS, stiff_beside_soft),
-    case("bone inside", &["deformation"], HOLDS, bone_inside),
-    case("spacing 1:10", &["deformation"], HOLDS, spacing_one_to_ten),
-    case("offset 0.01 to 0.99", &["deformation"], HOLDS, offsets_from_a_hundredth_to_nearly_one),
-    case("10⁵ pushes back and forth", &["deformation"], HOLDS_AND_RETURNS, back_and_forth),
-    case("at the border", &["deformation"], HOLDS, at_the_border),
-    case("on an element, between eight", &["deformation"], HOLDS, on_an_element_and_between_eight),
-    case("zero-length, huge, NaN and infinite moves", &["deformation"], HOLDS, bad_moves),
-    case("all bone", &["deformation"], HOLDS, all_bone),
-    case("two tools", &["deformation"], HOLDS, two_tools),
-    case("round regions in slices", &["deformation"], HOLDS, round_metric),
-    case("links of any stiffness", &["relaxation"], HOLDS_AND_RETURNS, links_of_any_stiffness),
-    case("a push in the middle of it", &["relaxation"], HOLDS, a_push_in_the_middle_of_relaxation),
-    case("restart half-way", &["relaxation", "plasticity", "cutting"], HOLDS_AND_RESUMES, restart_half_way),
-    case("pushed back and forth", &["plasticity"], HOLDS, plastic_back_and_forth),
-    case("a threshold changed while tissue is deformed", &["object-shape"], HOLDS, threshold_changed),
-    case("thin walls", &["object-shape"], HOLDS, thin_walls),
-    case("a void that closes", &["object-shape"], HOLDS, a_void_that_closes),
-    case("a blade that jumps", &["cutting"], HOLDS, a_blade_that_jumps),
-    case("cut again where it was cut", &["cutting"], HOLDS, cut_again_where_it_was_cut),
+    case("stiff beside soft", &["deformation"], HOLDS, &did(14.0, 1300.0, 1300.0, 0.0, 0.0), stiff_beside_soft),
+    case("bone inside", &["deformation"], HOLDS, &did(6.0, 200.0, 150.0, 0.0, 0.0), bone_inside),
+    case("spacing 1:10", &["deformation"], HOLDS, &did(10.0, 420.0, 430.0, 0.0, 0.0), spacing_one_to_ten),
+    case("offset 0.01 to 0.99", &["deformation"], HOLDS, &did(4.0, 190.0, 0.0, 0.0, 0.0), offsets_from_a_hundredth_to_nearly_one),
+    case("10⁵ pushes back and forth", &["deformation"], HOLDS_AND_RETURNS, &did(50000.0, 3.0, 0.0, 0.0, 3.0), back_and_forth),
+    case("at the border", &["deformation"], HOLDS, &did(25.0, 120.0, 100.0, 0.0, 0.0), at_the_border),
+    case("on an element, between eight", &["deformation"], HOLDS, &did(1.0, 430.0, 440.0, 0.0, 0.0), on_an_element_and_between_eight),
+    case("zero-length, huge, NaN and infinite moves", &["deformation"], HOLDS, &did(21.0, 400.0, 410.0, 0.0, 0.0), bad_moves),
+    case("all bone", &["deformation"], HOLDS, &did(5.0, 610.0, 9.0, 0.0, 0.0), all_bone),
+    case("two tools", &["deformation"], HOLDS, &did(6.0, 220.0, 230.0, 0.0, 0.0), two_tools),
+    case("round regions in slices", &["deformation"], HOLDS, &did(8.0, 670.0, 670.0, 0.0, 0.0), round_metric),
+    case("links of any stiffness", &["relaxation"], HOLDS_AND_RETURNS, &did(6.0, 500.0, 500.0, 0.0, 510.0), links_of_any_stiffness),
+    case("a push in the middle of it", &["relaxation"], HOLDS, &did(8.0, 1200.0, 1200.0, 0.0, 3500.0), a_push_in_the_middle_of_relaxation),
+    case(
+        "restart half-way",
+        &["relaxation", "plasticity", "cutting"],
+        HOLDS_AND_RESUMES,
+        &did(3.0, 750.0, 790.0, 52.0, 770.0),
+        restart_half_way,
+    ),
+    case(
+        "pushed back and forth",
+        &["plasticity"],
+        HOLDS,
+        &did_and("bricks of which a part of the displacement stays", 1.0, did(200.0, 130.0, 130.0, 0.0, 500.0)),
+        plastic_back_and_forth,
+    ),
+    case(
+        "a threshold changed while tissue is deformed",
+        &["object-shape"],
+        HOLDS,
+        &did_and("thresholds that changed something", 2.0, did(9.0, 2600.0, 2700.0, 0.0, 0.0)),
+        threshold_changed,
+    ),
+    case("thin walls", &["object-shape"], HOLDS, &did(8.0, 320.0, 300.0, 0.0, 0.0), thin_walls),
+    case("a void that closes", &["object-shape"], HOLDS, &did(3.0, 710.0, 320.0, 0.0, 0.0), a_void_that_closes),
+    case("a blade that jumps", &["cutting"], HOLDS, &did(5.0, 570.0, 570.0, 1500.0, 0.0), a_blade_that_jumps),
+    case(
+        "a block carried by whole voxels",
+        &["deformation"],
+        HOLDS_AND_CARRIES,
+        &did_and("voxels compared whose value is another", 70.0, did(1.0, 800.0, 800.0, 0.0, 0.0)),
+        a_block_carried_by_whole_voxels,
+    ),
+    case("cut again where it was cut", &["cutting"], HOLDS, &did(1.0, 48.0, 96.0, 140.0, 0.0), cut_again_where_it_was_cut),
 ];
 
 hard_cases! {
@@ -563,5 +700,6 @@ hard_cases! {
     thin_walls => 16,
     a_void_that_closes => 17,
     a_blade_that_jumps => 18,
-    cut_again_where_it_was_cut => 19,
+    a_block_carried_by_whole_voxels => 19,
+    cut_again_where_it_was_cut => 20,
 }

@@ -1,9 +1,12 @@
 //! Numerical stability: every hard case of DESIGN section 8, each a test by its name, and a table of them all.
 //!
 //! A case states its invariants with their bounds before it is run; it runs on one thread and on two and must give the same bits. Inputs are
-//! seeded with denormals, NaN and infinities; outputs of every stage are counted where they are not finite, and none may be. The last test
-//! prints the table with the worst value seen for each invariant, and asserts that every hard case that an effect declares in the scene's
-//! registry is there. Debug and release: `cargo test --test stability -- --nocapture`, and the same with `--release`.
+//! seeded with denormals, NaN and infinities; outputs of every stage are counted where they are not finite, and none may be. An engine that does
+//! nothing breaks no invariant, so a case states its **deeds** as well, each with the least of it that must have happened: elements moved, links cut,
+//! ticks in contact, pictures that show something. Where nothing happening is what is right (all is bone, a probe hears nothing), the deed is that of
+//! a control beside it. The last test prints the table with the worst value seen for each invariant and what was done, and asserts that every
+//! hard case of DESIGN section 8 and every one that an effect declares in the scene's registry is there. Debug and release:
+//! `cargo test --test stability -- --nocapture`, and the same with `--release`.
 
 mod breathing;
 mod chainmail;
@@ -32,9 +35,24 @@ pub(crate) const fn at_most(what: &'static str, unit: &'static str, bound: f64) 
     Invariant { what, unit, bound }
 }
 
-/// Worst value for each invariant of a case, and a digest of all outputs.
+/// Something that must have happened, with the least of it: what an engine that does nothing does not reach.
+pub(crate) struct Deed {
+    pub(crate) what: &'static str,
+    pub(crate) unit: &'static str,
+    pub(crate) least: f64,
+}
+
+/// Short for a table of deeds.
+pub(crate) const fn at_least(what: &'static str, unit: &'static str, least: f64) -> Deed {
+    Deed { what, unit, least }
+}
+
+/// Worst value for each invariant of a case, what was done, and a digest of all outputs.
+#[derive(Clone)]
 pub(crate) struct Seen {
     pub(crate) worst: Vec<f64>,
+    /// as much of each deed
+    pub(crate) did: Vec<f64>,
     pub(crate) digest: u64,
 }
 
@@ -46,18 +64,19 @@ pub(crate) struct Case {
     /// effects of the registry that declare it
     pub(crate) effects: &'static [&'static str],
     pub(crate) invariants: &'static [Invariant],
+    pub(crate) deeds: &'static [Deed],
     pub(crate) run: fn() -> Seen,
 }
 
-/// Worst values by engine and name of the case, each found once.
-type Results = BTreeMap<(&'static str, &'static str), Arc<OnceLock<Vec<f64>>>>;
+/// What was seen, by engine and name of the case, each once.
+type Results = BTreeMap<(&'static str, &'static str), Arc<OnceLock<Seen>>>;
 
 /// What was run: the table asks for all cases, and none runs twice.
 static RESULTS: Mutex<Results> = Mutex::new(BTreeMap::new());
 
 impl Case {
-    /// Worst values on one thread and on two, whose outputs are the same bits.
-    fn worst(&'static self) -> Vec<f64> {
+    /// What is seen on one thread and on two, whose outputs are the same bits.
+    fn seen(&'static self) -> Seen {
         let cell = Arc::clone(RESULTS.lock().unwrap_or_else(PoisonError::into_inner).entry((self.engine, self.name)).or_default());
         cell.get_or_init(|| {
             let [one, two] = [1, 2].map(|threads| {
@@ -66,18 +85,35 @@ impl Case {
             });
             assert_eq!(one.digest, two.digest, "{}, {}: one thread and two differ", self.engine, self.name);
             assert_eq!(one.worst.len(), self.invariants.len(), "{}: a value for each invariant", self.name);
+            assert_eq!(one.did.len(), self.deeds.len(), "{}: as much of each deed", self.name);
             // a NaN must not hide behind a maximum
-            one.worst.iter().zip(&two.worst).map(|(&a, &b)| if a >= b { a } else { b }).collect()
+            let worst = one.worst.iter().zip(&two.worst).map(|(&a, &b)| if a >= b { a } else { b }).collect();
+            let did = one.did.iter().zip(&two.did).map(|(&a, &b)| if a <= b { a } else { b }).collect();
+            Seen { worst, did, ..one }
         })
         .clone()
     }
 
-    /// Runs the case and asserts that every bound holds.
+    /// What of the case does not hold: (what, value, bound), of invariants and of deeds. A NaN holds nothing and is no deed.
+    fn broken(&'static self) -> Vec<String> {
+        assert!(!self.deeds.is_empty(), "{}, {}: what an engine that does nothing would not do", self.engine, self.name);
+        let seen = self.seen();
+        let above = |(i, worst): (&Invariant, f64)| {
+            (worst > i.bound || worst.is_nan())
+                .then(|| format!("{}, {}: {}: {worst} {}, and {} is allowed", self.engine, self.name, i.what, i.unit, i.bound))
+        };
+        let below = |(d, did): (&Deed, f64)| {
+            (did < d.least || did.is_nan())
+                .then(|| format!("{}, {}: {}: {did} {}, and {} is the least", self.engine, self.name, d.what, d.unit, d.least))
+        };
+        let invariants = self.invariants.iter().zip(seen.worst).filter_map(above);
+        invariants.chain(self.deeds.iter().zip(seen.did).filter_map(below)).collect()
+    }
+
+    /// Runs the case and asserts that every bound holds, and that something was done.
     pub(crate) fn hold(&'static self) {
-        for (invariant, worst) in self.invariants.iter().zip(self.worst()) {
-            let Invariant { what, unit, bound } = invariant;
-            assert!(worst <= *bound, "{}, {}: {what}: {worst} {unit}, and {bound} is allowed", self.engine, self.name);
-        }
+        let broken = self.broken();
+        assert!(broken.is_empty(), "{}", broken.join("; "));
     }
 }
 
@@ -122,6 +158,52 @@ macro_rules! hard_cases {
     };
 }
 
+/// The hard cases of DESIGN section 8, in its order, by the names that they have here; what an effect adds stands in the registry.
+const DESIGN: &[(&str, &str)] = &[
+    ("ChainMail", "stiff beside soft"),
+    ("ChainMail", "bone inside"),
+    ("ChainMail", "spacing 1:10"),
+    ("ChainMail", "offset 0.01 to 0.99"),
+    ("ChainMail", "10⁵ pushes back and forth"),
+    ("ChainMail", "at the border"),
+    ("ChainMail", "on an element, between eight"),
+    ("ChainMail", "zero-length, huge, NaN and infinite moves"),
+    ("ChainMail", "all bone"),
+    ("ChainMail", "two tools"),
+    ("ChainMail", "cut again where it was cut"),
+    ("ChainMail", "a threshold changed while tissue is deformed"),
+    ("inversion", "gradient near 1"),
+    ("inversion", "gradient past 1"),
+    ("inversion", "det J ≤ 0"),
+    ("inversion", "outside the field, far away, no numbers"),
+    ("needle", "three to two hundred nodes"),
+    ("needle", "stiffness over six decades"),
+    ("needle", "ticks of ten to a hundred milliseconds"),
+    ("needle", "a teleport"),
+    ("needle", "retraction in one tick"),
+    ("needle", "grazing entry"),
+    ("needle", "stiff friction"),
+    // poses that are NaN, and quaternions of no length
+    ("needle", "poses that are no numbers"),
+    ("haptics", "stiffness up to the passivity bound"),
+    ("haptics", "delay"),
+    ("haptics", "quantised encoder"),
+    ("haptics", "light grip"),
+    ("haptics", "frozen deformation"),
+    ("haptics", "thin and noisy surfaces"),
+    ("haptics", "leaving the volume"),
+    // each fitted with ε₀ = 0, too
+    ("surface", "constant values"),
+    ("surface", "a step"),
+    ("surface", "sheets of one voxel"),
+    ("surface", "odd sizes"),
+    ("rendering", "camera in tissue"),
+    ("rendering", "spacing 10:1"),
+    ("rendering", "zero gradient"),
+    ("rendering", "opaque and empty transfer functions"),
+    ("rendering", "displacement larger than the volume"),
+];
+
 fn all() -> impl Iterator<Item = &'static Case> {
     [chainmail::CASES, inversion::CASES, haptics::CASES, breathing::CASES, needle::CASES, rendering::CASES, surface::CASES]
         .into_iter()
@@ -130,20 +212,27 @@ fn all() -> impl Iterator<Item = &'static Case> {
 
 #[test]
 fn the_table_of_hard_cases_is_complete_and_every_invariant_holds() {
-    println!("{:10} {:48} {:44} {:>12} {:>12}", "engine", "hard case", "invariant", "worst", "bound");
+    println!("{:10} {:48} {:62} {:>12}   {:>9}", "engine", "hard case", "invariant, or what was done", "worst, least", "bound");
     let mut broken = Vec::new();
     for case in all() {
-        for (invariant, worst) in case.invariants.iter().zip(case.worst()) {
-            let Invariant { what, unit, bound } = invariant;
-            let what = if unit.is_empty() { (*what).to_owned() } else { format!("{what} [{unit}]") };
-            println!("{:10} {:48} {what:44} {worst:>12.3e} {bound:>12.1e}", case.engine, case.name);
-            // a NaN holds nothing
-            if worst > *bound || worst.is_nan() {
-                broken.push(format!("{}, {}: {what} {worst}", case.engine, case.name));
-            }
+        let seen = case.seen();
+        let named = |what: &str, unit: &str| if unit.is_empty() { what.to_owned() } else { format!("{what} [{unit}]") };
+        for (Invariant { what, unit, bound }, worst) in case.invariants.iter().zip(seen.worst) {
+            println!("{:10} {:48} {:62} {worst:>12.3e} ≤ {bound:>9.1e}", case.engine, case.name, named(what, unit));
         }
+        // what a case does not ask for is no row
+        for (Deed { what, unit, least }, did) in case.deeds.iter().zip(seen.did).filter(|(deed, _)| deed.least > 0.0) {
+            println!("{:10} {:48} {:62} {did:>12.3e} ≥ {least:>9.1e}", case.engine, case.name, named(what, unit));
+        }
+        broken.extend(case.broken());
     }
     assert!(broken.is_empty(), "{broken:#?}");
+    for (engine, name) in DESIGN {
+        assert!(
+            all().any(|case| (case.engine, case.name) == (*engine, *name)),
+            "{engine}: DESIGN section 8 has {name:?}, and nothing tries it"
+        );
+    }
     for effect in maille_scene::registry::EFFECTS {
         for name in effect.hard_cases {
             let found = all().any(|case| case.name == *name && case.effects.contains(&effect.name));

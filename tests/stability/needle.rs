@@ -1,7 +1,7 @@
 //! Hard cases of the needle.
 
 use crate::{
-    Case, Digest, Invariant, Seen, at_most, hard_cases,
+    Case, Deed, Digest, Invariant, Seen, at_least, at_most, hard_cases,
     made::{BAD, Random},
 };
 use maille_needle::{
@@ -20,6 +20,16 @@ const HOLDS: &[Invariant] = &[
     at_most("nodes of the path left outside the patient", "", 0.0),
 ];
 
+/// What each case did at least: in tissue, and felt.
+const fn did(ticks: f64, depth_mm: f64, force_n: f64, left: f64) -> [Deed; 4] {
+    [
+        at_least("ticks with the tip in tissue", "", ticks),
+        at_least("deepest", "mm", depth_mm),
+        at_least("largest force", "N", force_n),
+        at_least("times it came out again", "", left),
+    ]
+}
+
 fn config() -> NeedleConfig {
     let gauge = Gauge::of(16).expect("a gauge").with_bending(MEASURED_16G_N_MM2);
     NeedleConfig::new(RodParameters::new(&gauge, LENGTH_MM))
@@ -37,6 +47,8 @@ fn straight(depth: f64) -> HandlePose {
 /// The worst of all needles of a case.
 struct Bench {
     worst: [f64; 5],
+    /// ticks in tissue, depth, force, times that it came out
+    did: [f64; 4],
     digest: Digest,
 }
 
@@ -45,20 +57,21 @@ struct Watched<'b> {
     bench: &'b mut Bench,
     tool: NeedleTool,
     dt_s: f64,
+    inside: bool,
 }
 
 impl Bench {
     fn new() -> Self {
-        Self { worst: [0.0; 5], digest: Digest::new() }
+        Self { worst: [0.0; 5], did: [0.0; 4], digest: Digest::new() }
     }
 
     fn needle(&mut self, config: NeedleConfig, material: Material, dt_s: f64) -> Watched<'_> {
         let table = MaterialTable::new(&[material]).expect("a material");
-        Watched { bench: self, tool: NeedleTool::new(config, table).expect("a needle"), dt_s }
+        Watched { bench: self, tool: NeedleTool::new(config, table).expect("a needle"), dt_s, inside: false }
     }
 
     fn seen(self) -> Seen {
-        Seen { worst: self.worst.to_vec(), digest: self.digest.value() }
+        Seen { worst: self.worst.to_vec(), did: self.did.to_vec(), digest: self.digest.value() }
     }
 }
 
@@ -78,6 +91,12 @@ impl Watched<'_> {
         for pair in self.tool.nodes().windows(2) {
             worst[3] = worst[3].max(((pair[1] - pair[0]).norm() - segment).abs());
         }
+        let did = &mut self.bench.did;
+        did[0] += f64::from(u8::from(out.path_nodes > 0 && half_space(out.tip_mm) == 1));
+        did[1] = did[1].max(out.depth_mm);
+        did[2] = did[2].max(V3::from(out.force_n).norm());
+        did[3] += f64::from(u8::from(self.inside && out.path_nodes == 0));
+        self.inside = out.path_nodes > 0;
         self.bench.digest.floats(out.force_n);
     }
 
@@ -219,19 +238,19 @@ fn no_numbers() -> Seen {
     bench.seen()
 }
 
-const fn case(name: &'static str, run: fn() -> Seen) -> Case {
-    Case { engine: "needle", name, effects: &["needle"], invariants: HOLDS, run }
+const fn case(name: &'static str, deeds: &'static [Deed], run: fn() -> Seen) -> Case {
+    Case { engine: "needle", name, effects: &["needle"], invariants: HOLDS, deeds, run }
 }
 
 pub(crate) const CASES: &[Case] = &[
-    case("three to two hundred nodes", three_to_two_hundred_nodes),
-    case("stiffness over six decades", stiffness_over_six_decades),
-    case("ticks of ten to a hundred milliseconds", long_ticks),
-    case("a teleport", a_teleport),
-    case("retraction in one tick", retraction),
-    case("grazing entry", grazing_entry),
-    case("stiff friction", stiff_friction),
-    case("poses that are no numbers", no_numbers),
+    case("three to two hundred nodes", &did(1700.0, 34.0, 0.5, 3.0), three_to_two_hundred_nodes),
+    case("stiffness over six decades", &did(2800.0, 34.0, 1.0, 5.0), stiffness_over_six_decades),
+    case("ticks of ten to a hundred milliseconds", &did(410.0, 34.0, 0.3, 2.0), long_ticks),
+    case("a teleport", &did(740.0, 22.0, 2.0, 7.0), a_teleport),
+    case("retraction in one tick", &did(1100.0, 30.0, 0.3, 2.0), retraction),
+    case("grazing entry", &did(1900.0, 39.0, 0.3, 1.0), grazing_entry),
+    case("stiff friction", &did(940.0, 34.0, 2.0, 1.0), stiff_friction),
+    case("poses that are no numbers", &did(400.0, 20.0, 0.5, 6.0), no_numbers),
 ];
 
 hard_cases! {

@@ -1,7 +1,7 @@
 //! Hard cases of the ray caster.
 
 use crate::{
-    Case, Digest, Invariant, Seen, at_most, hard_cases,
+    Case, Deed, Digest, Invariant, Seen, at_least, at_most, hard_cases,
     made::{BAD, Random, volume},
 };
 use maille_raycast::{
@@ -25,22 +25,47 @@ const WARPED: &[Invariant] = &[
     at_most("fields of no numbers that were taken", "", 0.0),
 ];
 
+/// What each case did at least: it showed something, and refused what makes no sense.
+const fn did(pictures: f64, lit: f64, refused: f64) -> [Deed; 3] {
+    [
+        at_least("pictures that show something", "", pictures),
+        at_least("pixels not as where nothing is", "part", lit),
+        at_least("cameras and fields of no sense that were refused", "", refused),
+    ]
+}
+
 const W: usize = 72;
 const H: usize = 56;
 
 struct Bench {
     worst: [f64; 3],
+    /// pictures, those that show something, pixels of all that are not as where nothing is, refusals
+    pictures: usize,
+    shown: usize,
+    lit: usize,
+    refused: usize,
     digest: Digest,
 }
 
 impl Bench {
     fn new() -> Self {
-        Self { worst: [0.0; 3], digest: Digest::new() }
+        Self { worst: [0.0; 3], pictures: 0, shown: 0, lit: 0, refused: 0, digest: Digest::new() }
     }
 
     fn look(&mut self, picture: &Picture) {
         self.worst[1] += picture.depth.iter().flatten().filter(|d| d.is_nan() || **d <= 0.0).count() as f64;
         picture.rgb.iter().for_each(|&v| self.digest.add(v.into()));
+        // a ray that meets nothing leaves black
+        let lit = picture.rgb.chunks_exact(3).filter(|rgb| rgb.iter().any(|&v| v > 0)).count();
+        self.pictures += 1;
+        self.shown += usize::from(lit > 0);
+        self.lit += lit;
+    }
+
+    /// Something of no sense, that was taken or not.
+    fn taken(&mut self, taken: bool) {
+        self.worst[2] += f64::from(u8::from(taken));
+        self.refused += usize::from(!taken);
     }
 
     /// Draws by the fastest kernel and by the slowest.
@@ -60,8 +85,15 @@ impl Bench {
         self.worst[0] = self.worst[0].max(differ.count() as f64 / (W * H) as f64);
     }
 
+    /// The same of echoes, with a probe that hears something beside those of the case.
+    fn echoes(self) -> Seen {
+        let [part, loudest] = on_tissue();
+        Seen { did: vec![part, loudest, self.refused as f64], ..self.seen() }
+    }
+
     fn seen(self) -> Seen {
-        Seen { worst: self.worst.to_vec(), digest: self.digest.value() }
+        let did = vec![self.shown as f64, self.lit as f64 / (self.pictures.max(1) * W * H) as f64, self.refused as f64];
+        Seen { worst: self.worst.to_vec(), did, digest: self.digest.value() }
     }
 }
 
@@ -142,7 +174,8 @@ fn cameras_of_no_sense() -> Seen {
     let skip = Skip::new(&source, &settings);
     let mut refused = |camera: Camera| {
         let mut picture = Picture::with_depth(8, 8);
-        bench.worst[2] += f64::from(u8::from(render_extra(&Extras::default(), &source, &skip, &camera, &settings, &mut picture).is_ok()));
+        let drawn = render_extra(&Extras::default(), &source, &skip, &camera, &settings, &mut picture).is_ok();
+        bench.taken(drawn);
     };
     for bad in BAD.into_iter().filter(|v| !v.is_finite()) {
         for c in 0..3 {
@@ -160,6 +193,7 @@ fn cameras_of_no_sense() -> Seen {
     refused(Camera { up: [0.0; 3], ..good });
     refused(Camera { fov_deg: 0.0, ..good });
     refused(Camera { fov_deg: 180.0, ..good });
+    bench.draw(&source, &good, &settings);
     // far away, and with an up of the smallest numbers: a picture, or a refusal, but finite
     for eye in [[1e7, 0.0, 0.0], [0.0, -1e5, 1e5]] {
         bench.draw(&source, &Camera { eye, fov_deg: 1e-3, ..good }, &settings);
@@ -199,10 +233,10 @@ fn displacement_larger_than_the_volume() -> Seen {
                 bench.look(&picture);
             }
         }
-        bench.worst[2] += f64::from(u8::from(warp.update(source.info(), &motion, &[f32::NAN]).is_ok()));
+        bench.taken(warp.update(source.info(), &motion, &[f32::NAN]).is_ok());
     }
     for bad in BAD.into_iter().filter(|v| !v.is_finite()) {
-        bench.worst[2] += f64::from(u8::from(Motion::single(&field(&|x| [0.0, if x[0] > 20.0 { bad } else { 0.0 }, 0.0])).is_ok()));
+        bench.taken(Motion::single(&field(&|x| [0.0, if x[0] > 20.0 { bad } else { 0.0 }, 0.0])).is_ok());
     }
     bench.seen()
 }
@@ -213,6 +247,27 @@ const ECHOES: &[Invariant] = &[
     at_most("amplitudes above a perfect mirror's, as a part of it", "1", 1.0),
     at_most("probes of no sense that were drawn", "", 0.0),
 ];
+
+/// What was heard at least, and refused.
+const fn heard(part: f64, loudest: f64, refused: f64) -> [Deed; 3] {
+    [
+        at_least("samples of a probe on tissue that give an echo", "part", part),
+        at_least("the loudest of them, as a part of a perfect mirror's", "1", loudest),
+        at_least("probes of no sense that were refused", "", refused),
+    ]
+}
+
+/// What a probe that touches the patient hears: samples with an echo, and the loudest.
+fn on_tissue() -> [f64; 2] {
+    let found = echoes(&patient([1.0; 3]), &Ultrasound::new(on_skin()), None).expect("a probe that makes sense");
+    let part = found.amplitude.iter().filter(|a| **a > 0.0).count() as f64 / found.amplitude.len().max(1) as f64;
+    [part, found.amplitude.iter().fold(0.0, |m, a| m.max(f64::from(*a)))]
+}
+
+/// A probe on the ball of soft tissue of [`patient`].
+fn on_skin() -> Probe {
+    Probe::convex([20.0, 3.0, 16.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+}
 
 /// Fans over a patient; the loudest echo and what is no amplitude.
 fn fans(source: &BrickedVolume, probes: &[Probe]) -> Seen {
@@ -225,7 +280,7 @@ fn fans(source: &BrickedVolume, probes: &[Probe]) -> Seen {
             found.amplitude.iter().for_each(|a| bench.digest.add(a.to_bits().into()));
         }
     }
-    bench.seen()
+    bench.echoes()
 }
 
 fn a_probe_in_the_air() -> Seen {
@@ -248,7 +303,7 @@ fn bone_and_gas_before_tissue() -> Seen {
 fn a_probe_that_looks_nowhere() -> Seen {
     let (source, mut bench) = (patient([1.0; 3]), Bench::new());
     let good = Probe::convex([20.0, 0.0, 16.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]);
-    let mut refused = |probe: Probe| bench.worst[2] += f64::from(u8::from(echoes(&source, &Ultrasound::new(probe), None).is_some()));
+    let mut refused = |probe: Probe| bench.taken(echoes(&source, &Ultrasound::new(probe), None).is_some());
     refused(Probe { direction: [0.0; 3], ..good });
     refused(Probe { across: good.direction, ..good });
     for bad in BAD.into_iter().filter(|v| !v.is_finite()) {
@@ -260,23 +315,23 @@ fn a_probe_that_looks_nowhere() -> Seen {
     }
     refused(Probe { angle_deg: 180.0, ..good });
     refused(Probe { radius_mm: -1.0, ..good });
-    bench.seen()
+    bench.echoes()
 }
 
-const fn case(name: &'static str, invariants: &'static [Invariant], run: fn() -> Seen) -> Case {
-    Case { engine: "rendering", name, effects: &["view", "breathing", "ultrasound"], invariants, run }
+const fn case(name: &'static str, invariants: &'static [Invariant], deeds: &'static [Deed], run: fn() -> Seen) -> Case {
+    Case { engine: "rendering", name, effects: &["view", "breathing", "ultrasound"], invariants, deeds, run }
 }
 
 pub(crate) const CASES: &[Case] = &[
-    case("camera in tissue", HOLDS, camera_in_tissue),
-    case("spacing 10:1", HOLDS, spacing_ten_to_one),
-    case("zero gradient", HOLDS, zero_gradient),
-    case("opaque and empty transfer functions", HOLDS, opaque_and_empty),
-    case("cameras of no sense", HOLDS, cameras_of_no_sense),
-    case("displacement larger than the volume", WARPED, displacement_larger_than_the_volume),
-    case("a probe in the air", ECHOES, a_probe_in_the_air),
-    case("bone and gas before tissue", ECHOES, bone_and_gas_before_tissue),
-    case("a probe that looks nowhere", ECHOES, a_probe_that_looks_nowhere),
+    case("camera in tissue", HOLDS, &did(56.0, 0.3, 0.0), camera_in_tissue),
+    case("spacing 10:1", HOLDS, &did(16.0, 0.02, 0.0), spacing_ten_to_one),
+    case("zero gradient", HOLDS, &did(11.0, 0.09, 0.0), zero_gradient),
+    case("opaque and empty transfer functions", HOLDS, &did(6.0, 0.06, 0.0), opaque_and_empty),
+    case("cameras of no sense", HOLDS, &did(3.0, 0.2, 34.0), cameras_of_no_sense),
+    case("displacement larger than the volume", WARPED, &did(5.0, 0.09, 8.0), displacement_larger_than_the_volume),
+    case("a probe in the air", ECHOES, &heard(0.08, 0.3, 0.0), a_probe_in_the_air),
+    case("bone and gas before tissue", ECHOES, &heard(0.08, 0.3, 0.0), bone_and_gas_before_tissue),
+    case("a probe that looks nowhere", ECHOES, &heard(0.08, 0.3, 19.0), a_probe_that_looks_nowhere),
 ];
 
 hard_cases! {

@@ -5,14 +5,17 @@
 //! memory, processes. **Added** by an effect is its run minus the run of what it depends on, nothing else; of `everything` it is all effects that get
 //! along minus the view alone. With several rounds, whole rounds follow each other and each figure is the median.
 //!
-//! A later effect takes part by standing in the registry; what it needs of tool or tissue to have anything to do is a line in [`prepare`]. Times are
-//! of all processes running at once on this machine, so they hold what these take from each other.
+//! A later effect takes part by standing in the registry; what it needs of tool or tissue to have anything to do is a line in [`prepare`], what of a
+//! scene makes no sense without it one in [`take_out`], and what both of its runs must have, so that nothing but the effect differs, one in [`ground`].
+//! An effect that this base cannot have, or whose runs fail, says why in its row; the others are measured all the same. Times are of all processes
+//! running at once on this machine, so they hold what these take from each other.
 
 use crate::{TradeoffError, interruption, io, measure::Quartiles, report::load_1m};
 use maille_scene::{
-    EffectSetting, Organ, Process, Scene,
+    Device, EffectSetting, Organ, Process, Scene,
+    breathing::Breathing,
     registry::{CalledBy, EFFECTS, Effect, effect},
-    sections,
+    sections::{self, TouchedSurface},
     tool::{Shape, ToolKind},
 };
 use serde::Serialize;
@@ -217,19 +220,76 @@ fn prepare(scene: &mut Scene, name: &str) {
             }
         }
         "palpation" => {
-            if let Some(tool) = &mut scene.tool {
-                (tool.shape, tool.radius_mm) = (Shape::Finger, tool.radius_mm.max(5.0));
+            // a scene whose tool has a face keeps its own
+            if let Some(tool) = scene.tool.as_mut().filter(|tool| !has_face(tool.shape)) {
+                tool.shape = Shape::Finger;
             }
         }
         // a scene that has organs keeps its own
         "labels" if scene.organs.is_empty() => {
             scene.organs.push(Organ { name: "bone".into(), hu: vec![[300.0, 3000.0]], islands_mm3: 100.0, ..Organ::default() })
         }
-        "plasticity" => {
-            scene.deformation.relaxation = sections::Relaxation::Elastic;
-            scene.tissues.iter_mut().for_each(|row| row.plastic = 0.3);
+        "plasticity" if scene.tissues.iter().all(|row| row.plastic == 0.0) => scene.tissues.iter_mut().for_each(|row| row.plastic = 0.3),
+        _ => {}
+    }
+}
+
+/// What an effect works on, given to its run and to the one that it is compared with: else the difference of two grounds would count as the effect's.
+fn ground(scene: &mut Scene, name: &str) {
+    match name {
+        // the only kind that knows what is plastic
+        "plasticity" => scene.deformation.relaxation = sections::Relaxation::Elastic,
+        "palpation" => {
+            if let Some(tool) = &mut scene.tool {
+                tool.radius_mm = tool.radius_mm.max(5.0);
+            }
+        }
+        // felt with one ball only, and nobody looks at an octree beside the interpolated voxels
+        "smooth-surface" | "octree" => {
+            if let Some(tool) = &mut scene.tool {
+                tool.shape = Shape::Tip;
+            }
+            scene.haptic.surface = scene.haptic.surface.filter(|surface| *surface != TouchedSurface::Interpolated);
         }
         _ => {}
+    }
+}
+
+/// Takes an effect out of a scene: with its name goes what makes no sense without it.
+fn take_out(scene: &mut Scene, name: &str) {
+    match name {
+        "contact" => scene.tool = None,
+        "labels" => {
+            (scene.organs, scene.rendering.alone) = (Vec::new(), None);
+            scene.meshes.retain(|mesh| mesh.organ.is_none());
+        }
+        "breathing" => scene.breathing = Breathing::default(),
+        "smooth-surface" => scene.haptic.surface = None,
+        _ => {
+            if let Some(tool) = &mut scene.tool {
+                if kind_of(name) == Some(tool.kind) {
+                    // the same way, gone by a ball
+                    tool.kind = ToolKind::Probe;
+                }
+                if name == "palpation" && has_face(tool.shape) {
+                    tool.shape = Shape::Tip;
+                }
+            }
+        }
+    }
+}
+
+fn has_face(shape: Shape) -> bool {
+    matches!(shape, Shape::Finger | Shape::Probe)
+}
+
+/// The kind of tool that stands for an effect.
+fn kind_of(name: &str) -> Option<ToolKind> {
+    match name {
+        "cutting" => Some(ToolKind::Blade),
+        "incision" => Some(ToolKind::Incision),
+        "needle" => Some(ToolKind::Needle),
+        _ => None,
     }
 }
 
@@ -258,22 +318,18 @@ fn closure(name: &str) -> BTreeSet<&'static str> {
     all
 }
 
-/// The scene with these effects and no others.
-fn scene_of(base: &Scene, effects: &BTreeSet<&str>) -> Scene {
+/// The scene with these effects and no others, on the ground of one of them that is to be compared.
+fn scene_of(base: &Scene, effects: &BTreeSet<&str>, compared: &str) -> Scene {
     let mut scene = base.clone();
     scene.effects.clear();
-    for name in effects {
-        if effect(name).is_some_and(|e| e.called_by == CalledBy::Effects) {
-            scene.effects.insert((*name).into(), EffectSetting::Switch(true));
+    for e in EFFECTS {
+        if !effects.contains(e.name) {
+            take_out(&mut scene, e.name);
+        } else if e.called_by == CalledBy::Effects {
+            scene.effects.insert(e.name.into(), EffectSetting::Switch(true));
         }
     }
-    let has_tool = effects.iter().any(|n| effect(n).is_some_and(|e| e.called_by == CalledBy::Section("tool")));
-    if !has_tool {
-        scene.tool = None;
-    }
-    if !effects.contains("labels") {
-        (scene.organs, scene.rendering.alone) = (Vec::new(), None);
-    }
+    effects.iter().chain([&compared]).for_each(|name| ground(&mut scene, name));
     for name in effects {
         prepare(&mut scene, name);
     }
@@ -282,6 +338,33 @@ fn scene_of(base: &Scene, effects: &BTreeSet<&str>) -> Scene {
     scene.rendering.adapt = false;
     scene
 }
+
+/// An effect to be measured.
+struct Wanted<'a> {
+    name: &'a str,
+    /// effects of the two runs
+    sets: [BTreeSet<&'a str>; 2],
+    /// with it, without it
+    scenes: [Scene; 2],
+}
+
+impl<'a> Wanted<'a> {
+    fn new(base: &Scene, name: &'a str, with: BTreeSet<&'a str>) -> Self {
+        let without = if name == EVERYTHING { BTreeSet::new() } else { with.iter().copied().filter(|n| *n != name).collect() };
+        let scenes = [scene_of(base, &with, name), scene_of(base, &without, name)];
+        Self { name, sets: [with, without], scenes }
+    }
+
+    /// Why it cannot be run.
+    fn fault(&self) -> Option<String> {
+        let [with, without] = &self.scenes;
+        let cannot = |what: &str, fault: String| format!("this scene cannot {what}: {fault}");
+        fault(with).map(|f| cannot("have it", f)).or_else(|| fault(without).map(|f| cannot("be without it", f)))
+    }
+}
+
+/// All effects together, in place of an effect's name.
+const EVERYTHING: &str = "everything";
 
 /// Whether the scene's text is one that `maille run` takes.
 fn fault(scene: &Scene) -> Option<String> {
@@ -294,18 +377,18 @@ fn fault(scene: &Scene) -> Option<String> {
 /// # Errors
 /// When an effect makes no scene of this base: it is named, with the reason.
 pub fn scenes(base: &Scene) -> Result<Vec<(&'static str, Scene)>, TradeoffError> {
-    let mut all: Vec<(&'static str, Scene)> = vec![("view", scene_of(base, &BTreeSet::new()))];
+    let mut all: Vec<(&'static str, Scene)> = vec![("view", scene_of(base, &BTreeSet::new(), "view"))];
     let mut everything = BTreeSet::new();
     for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always) {
         let with = closure(e.name);
-        let scene = scene_of(base, &with);
+        let scene = scene_of(base, &with, e.name);
         if let Some(fault) = fault(&scene) {
             return Err(TradeoffError::Run(format!("no scene has the effect {}: {fault}", e.name)));
         }
         all.push((e.name, scene));
         join(base, &mut everything, &with);
     }
-    all.push(("everything", scene_of(base, &everything)));
+    all.push((EVERYTHING, scene_of(base, &everything, EVERYTHING)));
     Ok(all)
 }
 
@@ -334,6 +417,10 @@ fn base(options: &EffectsOptions) -> Result<Scene, TradeoffError> {
     if scene.tool.is_none() {
         scene.tool = Scene::builtin_default().tool;
     }
+    // nobody is there to hold it
+    if let Some(tool) = scene.tool.as_mut().filter(|tool| !matches!(tool.device, Device::Path | Device::Sim)) {
+        tool.device = Device::Path;
+    }
     Ok(scene)
 }
 
@@ -349,92 +436,78 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
         return Err(TradeoffError::Unknown { what: "effect", name: name.clone(), known: names });
     }
     let looked_at = |e: &&&Effect| options.only.is_empty() || options.only.iter().any(|n| n == e.name);
-    let nothing = BTreeSet::new();
-    // (name, with, without), and what cannot be run
-    let mut wanted: Vec<(String, BTreeSet<&str>, BTreeSet<&str>)> = Vec::new();
-    let mut notes: BTreeMap<String, String> = BTreeMap::new();
+    // a note says why an effect cannot be run, or of one that is what to make of it
+    let mut notes: BTreeMap<&str, String> = BTreeMap::new();
+    let mut wanted: Vec<Wanted<'_>> = Vec::new();
     let mut everything: BTreeSet<&str> = BTreeSet::new();
     let mut left_out = Vec::new();
     for e in known.iter().filter(looked_at) {
-        let with = closure(e.name);
-        let mut without = with.clone();
-        without.remove(e.name);
-        if let Some(fault) = fault(&scene_of(&base, &with)) {
-            notes.insert(e.name.into(), format!("this scene cannot have it: {fault}"));
-        } else {
-            if let Some(kind) = own_tool(e.name).filter(|_| with.contains("deformation")) {
-                notes.insert(
-                    e.name.into(),
-                    format!("its tool is {kind}: steps are not those of a push, and what is added to them says nothing"),
-                );
-            }
-            if !join(&base, &mut everything, &with) {
-                left_out.push(e.name);
-            }
+        let one = Wanted::new(&base, e.name, closure(e.name));
+        if one.fault().is_none() && !join(&base, &mut everything, &one.sets[0]) {
+            left_out.push(e.name);
         }
-        wanted.push((e.name.into(), with, without));
+        if let Some(kind) = own_tool(e.name).filter(|_| one.sets[0].contains("deformation")) {
+            notes.insert(e.name, format!("its tool is {kind}: steps are not those of a push, and what is added to them says nothing"));
+        }
+        wanted.push(one);
     }
     if options.only.is_empty() {
-        wanted.push(("everything".into(), everything.clone(), nothing.clone()));
         let tool = everything.iter().find_map(|name| own_tool(name));
         let held = tool.map(|kind| format!("its tool is {kind}: steps are not those of a push"));
         let without = (!left_out.is_empty()).then(|| format!("without {}, which do not get along with the others", left_out.join(", ")));
         let note: Vec<String> = without.into_iter().chain(held).collect();
         if !note.is_empty() {
-            notes.insert("everything".into(), note.join("; "));
+            notes.insert(EVERYTHING, note.join("; "));
         }
+        wanted.push(Wanted::new(&base, EVERYTHING, everything));
     }
-
-    // a note says why an effect cannot be run, or of one that is what to make of it
-    let runs =
-        |name: &str| name == "everything" || own_tool(name).is_some_and(|_| fault_free(&base, &closure(name))) || !notes.contains_key(name);
-    let mut sets: Vec<BTreeSet<&str>> = Vec::new();
-    for (name, with, without) in &wanted {
-        if runs(name) {
-            for set in [without, with] {
-                if !sets.contains(set) {
-                    sets.push(set.clone());
+    let interrupted = interruption()?;
+    let scratch = Scratch::make()?;
+    let mut tried: Vec<Tried> = Vec::new();
+    for one in &wanted {
+        match one.fault() {
+            Some(fault) => drop(notes.insert(one.name, fault)),
+            None => {
+                // without it first
+                for (set, scene) in one.sets.iter().zip(&one.scenes).rev() {
+                    if place(&tried, scene).is_none() {
+                        tried.push(Tried::new(set, scene));
+                    }
                 }
             }
         }
     }
-    let interrupted = interruption()?;
-    let scratch = Scratch::make()?;
-    let mut measured: Vec<Vec<Measure>> = vec![Vec::new(); sets.len()];
-    let mut processes: Vec<Vec<String>> = vec![Vec::new(); sets.len()];
     for _ in 0..options.rounds.max(1) {
-        for (n, set) in sets.iter().enumerate() {
-            let names = set.iter().copied().collect::<Vec<_>>().join(" + ");
-            told(if names.is_empty() { "the view alone" } else { &names });
-            let report = run(options, &scene_of(&base, set), &scratch.0, &interrupted)?;
-            measured[n].push(Measure::of(&report));
-            processes[n] = report["services"].as_object().map(|s| s.keys().cloned().collect()).unwrap_or_default();
+        for one in &mut tried {
+            one.turn(options, &scratch.0, &interrupted, &mut told)?;
         }
     }
-    let all_runs: Vec<Run> = sets
-        .iter()
-        .zip(&measured)
-        .zip(processes)
-        .map(|((set, all), processes)| Run { effects: set.iter().map(|n| (*n).into()).collect(), measure: Measure::median(all), processes })
-        .collect();
-    let place = |set: &BTreeSet<&str>| sets.iter().position(|s| s == set);
-    let effects = wanted
-        .into_iter()
-        .map(|(effect, with, without)| {
-            // differences within a round, then their median
-            let both = place(&with).zip(place(&without)).filter(|_| runs(&effect));
-            let added = both.map(|(a, b)| {
-                let each: Vec<Measure> = measured[a].iter().zip(&measured[b]).map(|(a, b)| a.with(*b, |a, b| a - b)).collect();
-                Measure::median(&each)
-            });
-            let processes_added = both.map_or(Vec::new(), |(a, b)| {
-                all_runs[a].processes.iter().filter(|p| !all_runs[b].processes.contains(p)).cloned().collect()
-            });
-            let over = std::iter::once("view").chain(without).map(Into::into).collect();
-            let note = notes.get(&effect).cloned();
-            Added { effect, over, added, processes_added, note }
-        })
-        .collect();
+    let mut effects = Vec::new();
+    for one in &wanted {
+        let [with, without] = one.scenes.each_ref().map(|scene| place(&tried, scene).map(|n| &tried[n]));
+        if let Some(failed) = with.into_iter().chain(without).find_map(|run| run.failed.as_ref()) {
+            notes.insert(one.name, failed.clone());
+        }
+        let both = with.zip(without).filter(|(a, b)| a.failed.is_none() && b.failed.is_none());
+        // differences within a round, then their median
+        let added = both.map(|(a, b)| {
+            let each: Vec<Measure> = a.measured.iter().zip(&b.measured).map(|(a, b)| a.with(*b, |a, b| a - b)).collect();
+            Measure::median(&each)
+        });
+        let brought = |(a, b): (&Tried, &Tried)| a.processes.iter().filter(|p| !b.processes.contains(p)).cloned().collect();
+        effects.push(Added {
+            effect: one.name.into(),
+            over: std::iter::once("view").chain(one.sets[1].iter().copied()).map(Into::into).collect(),
+            added,
+            processes_added: both.map_or(Vec::new(), brought),
+            note: notes.get(one.name).cloned(),
+        });
+    }
+    if effects.iter().all(|e| e.added.is_none()) {
+        let why = effects.iter().map(|e| format!("{}: {}", e.effect, e.note.as_deref().unwrap_or("not measured")));
+        return Err(TradeoffError::Run(format!("no effect could be measured; {}", why.collect::<Vec<_>>().join("; "))));
+    }
+    let all_runs = tried.into_iter().filter(|run| run.failed.is_none()).map(Tried::into_run).collect();
     let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model = cpu.lines().find_map(|l| l.strip_prefix("model name")).and_then(|l| l.split(':').nth(1)).unwrap_or("unknown");
     Ok(EffectsReport {
@@ -450,6 +523,59 @@ pub fn effects(options: &EffectsOptions, mut told: impl FnMut(&str)) -> Result<E
     })
 }
 
+/// A scene that is run, once a round.
+struct Tried {
+    effects: Vec<String>,
+    scene: Scene,
+    measured: Vec<Measure>,
+    processes: Vec<String>,
+    /// what went wrong; then it is not run again
+    failed: Option<String>,
+}
+
+impl Tried {
+    fn new(effects: &BTreeSet<&str>, scene: &Scene) -> Self {
+        let effects = effects.iter().map(|name| (*name).into()).collect();
+        Self { effects, scene: scene.clone(), measured: Vec::new(), processes: Vec::new(), failed: None }
+    }
+
+    /// Runs it; a failure is kept, and nothing but the user's wish ends the others.
+    fn turn(
+        &mut self,
+        options: &EffectsOptions,
+        scratch: &Path,
+        interrupted: &AtomicBool,
+        told: &mut impl FnMut(&str),
+    ) -> Result<(), TradeoffError> {
+        if self.failed.is_some() {
+            return Ok(());
+        }
+        let names = self.effects.join(" + ");
+        told(if names.is_empty() { "the view alone" } else { &names });
+        match run(options, &self.scene, scratch, interrupted) {
+            Ok(report) => {
+                self.measured.push(Measure::of(&report));
+                self.processes = report["services"].as_object().map(|s| s.keys().cloned().collect()).unwrap_or_default();
+            }
+            Err(TradeoffError::Interrupted) => return Err(TradeoffError::Interrupted),
+            Err(why) => {
+                told(&why.to_string());
+                self.failed = Some(why.to_string());
+            }
+        }
+        Ok(())
+    }
+
+    fn into_run(self) -> Run {
+        Run { measure: Measure::median(&self.measured), effects: self.effects, processes: self.processes }
+    }
+}
+
+/// Where a scene stands among those that are run: each runs once a round, whatever it is compared with.
+fn place(tried: &[Tried], scene: &Scene) -> Option<usize> {
+    tried.iter().position(|run| run.scene == *scene)
+}
+
 /// Adds effects to a set, where one scene and one tool can have them all.
 fn join(base: &Scene, all: &mut BTreeSet<&'static str>, more: &BTreeSet<&'static str>) -> bool {
     let union: BTreeSet<&str> = all.union(more).copied().collect();
@@ -462,7 +588,7 @@ fn join(base: &Scene, all: &mut BTreeSet<&'static str>, more: &BTreeSet<&'static
 }
 
 fn fault_free(base: &Scene, effects: &BTreeSet<&str>) -> bool {
-    fault(&scene_of(base, effects)).is_none()
+    fault(&scene_of(base, effects, EVERYTHING)).is_none()
 }
 
 fn command(options: &EffectsOptions) -> String {
@@ -631,14 +757,74 @@ mod tests {
     fn every_effect_of_the_registry_makes_a_scene_that_runs() {
         let base = Scene::parse("the base scene", BASE).unwrap();
         for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always) {
-            let with = closure(e.name);
-            let scene = scene_of(&base, &with);
-            assert_eq!(fault(&scene), None, "{}: give it what it needs in `prepare`", e.name);
-            assert!(scene.has_effect(e.name), "{}", e.name);
-            let mut without = with.clone();
-            assert!(without.remove(e.name));
-            assert!(fault_free(&base, &without) && !scene_of(&base, &without).has_effect(e.name), "{}", e.name);
+            let wanted = Wanted::new(&base, e.name, closure(e.name));
+            assert_eq!(wanted.fault(), None, "{}: give it what it needs in `prepare`", e.name);
+            let [with, without] = wanted.scenes.each_ref().map(|scene| scene.has_effect(e.name));
+            assert!(with && !without, "{}", e.name);
         }
+    }
+
+    /// The project's scenes, whose tools, surfaces and breath belong to effects that are taken out one by one.
+    #[test]
+    fn the_scenes_of_the_project_can_have_every_effect_and_be_without_it() {
+        let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
+        let mut bases: Vec<(String, Scene)> = fs::read_dir(config)
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .filter(|path| path.extension().is_some_and(|e| e == "toml"))
+            .map(|path| (path.display().to_string(), Scene::parse("a scene", &fs::read_to_string(&path).unwrap()).unwrap()))
+            .collect();
+        assert!(bases.len() > 5, "{}", bases.len());
+        for (name, more) in [("finger", "[tool]\nshape = \"finger\"\n"), ("patch", "[haptic]\nsurface = \"patch\"\n")] {
+            let effect = if name == "finger" { "palpation" } else { "smooth-surface" };
+            let mut base: toml::Table = toml::from_str(BASE).unwrap();
+            let more: toml::Table = toml::from_str(more).unwrap();
+            for (key, table) in more {
+                let of = base.entry(key).or_insert(toml::Value::Table(toml::Table::new()));
+                of.as_table_mut().unwrap().extend(table.as_table().unwrap().clone());
+            }
+            base.insert("effects".into(), toml::Value::Table([(effect.to_owned(), toml::Value::Boolean(true))].into_iter().collect()));
+            bases.push((name.into(), Scene::parse(name, &base.to_string()).unwrap()));
+        }
+        for (name, base) in &bases {
+            for e in EFFECTS.iter().filter(|e| e.called_by != CalledBy::Always) {
+                let wanted = Wanted::new(base, e.name, closure(e.name));
+                if let Some(fault) = wanted.fault() {
+                    // only a patient of whom nothing says how it breathes cannot
+                    assert!(
+                        e.name == "breathing" && fault.contains("nothing says how this patient breathes"),
+                        "{name}, {}: {fault}",
+                        e.name
+                    );
+                    assert!(!base.has_effect(e.name), "{name} has {}", e.name);
+                    continue;
+                }
+                assert!(wanted.scenes[0].has_effect(e.name) && !wanted.scenes[1].has_effect(e.name), "{name}, {}", e.name);
+            }
+        }
+    }
+
+    #[test]
+    fn two_scenes_that_are_compared_differ_in_nothing_but_the_effect() {
+        /// Keys that are the effect itself: its name, its tool, its organs, what of tissue only it reads.
+        fn without_its_own(scene: &Scene) -> toml::Table {
+            let mut all: toml::Table = toml::from_str(&scene.to_toml()).unwrap();
+            for key in ["effects", "organ"] {
+                all.remove(key);
+            }
+            let tool = all.get_mut("tool").and_then(|t| t.as_table_mut());
+            tool.into_iter().for_each(|tool| tool.retain(|key, _| key != "kind" && key != "shape"));
+            let rows = all.get_mut("tissue").and_then(|t| t.as_array_mut()).unwrap();
+            rows.iter_mut().for_each(|row| drop(row.as_table_mut().unwrap().remove("plastic")));
+            all
+        }
+        let base = Scene::parse("the base scene", BASE).unwrap();
+        for e in EFFECTS.iter().filter(|e| e.called_by == CalledBy::Effects) {
+            let [with, without] = Wanted::new(&base, e.name, closure(e.name)).scenes;
+            assert_eq!(without_its_own(&with), without_its_own(&without), "{}: what both need belongs in `ground`", e.name);
+        }
+        let [with, without] = Wanted::new(&base, "plasticity", closure("plasticity")).scenes;
+        assert_eq!([with, without].map(|s| s.deformation.relaxation), [sections::Relaxation::Elastic; 2]);
     }
 
     #[test]
@@ -663,7 +849,7 @@ mod tests {
         assert_eq!(closure("plasticity"), ["contact", "deformation", "plasticity", "relaxation"].into());
         assert_eq!(closure("sections"), ["sections"].into());
         let base = Scene::parse("the base scene", BASE).unwrap();
-        let alone = scene_of(&base, &BTreeSet::new());
+        let alone = scene_of(&base, &BTreeSet::new(), "view");
         assert!(alone.tool.is_none() && alone.effects.is_empty());
     }
 
