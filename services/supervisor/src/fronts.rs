@@ -4,7 +4,7 @@
 
 use crate::SupervisorError;
 use maille_governor::FrontPoint;
-use maille_scene::{limits, registry};
+use maille_scene::{EffectSetting, Scene, limits, registry};
 use serde::Deserialize;
 use std::{fs, path::Path};
 
@@ -69,6 +69,13 @@ impl Fronts {
             let range = limits::limit(name)
                 .filter(|_| registry::live_knob(name).is_some())
                 .map_or(f64::NEG_INFINITY..=f64::INFINITY, |l| l.low..=l.high);
+            let live = registry::live_knob(name).and_then(|_| registry::knob(name));
+            if !live.is_none_or(|knob| is_taken(knob, p.value)) {
+                return Err(SupervisorError::Refused(format!(
+                    "{source} has a point of {name} at {}, which no scene takes: `maille tradeoff` writes values that a scene may have",
+                    p.value
+                )));
+            }
             if !(p.time > 0.0 && p.time.is_finite() && p.error >= 0.0 && p.error.is_finite() && range.contains(&p.value)) {
                 return Err(SupervisorError::Refused(format!(
                     "{source} has a point of {name} that nobody can have measured (value {}, time {}, error {}): `maille tradeoff` writes times above 0, \
@@ -76,6 +83,12 @@ impl Fronts {
                     p.value, p.time, p.error
                 )));
             }
+        }
+        let named = |f: &Front| f.knob.clone().filter(|name| registry::live_knob(name).is_some());
+        if let Some(name) = read.fronts.iter().filter(|f| f.points.is_empty()).find_map(named) {
+            return Err(SupervisorError::Refused(format!(
+                "{source} has a front of {name} without points, and so nothing that could be given up for time: `maille tradeoff` writes what it measured"
+            )));
         }
         if !read.fronts.iter().any(|f| f.knob.as_deref().is_some_and(|name| registry::live_knob(name).is_some())) {
             return Err(SupervisorError::Refused(format!(
@@ -90,6 +103,15 @@ impl Fronts {
         let front = self.fronts.iter().find(|f| f.knob.as_deref() == Some(knob))?;
         Some(front.points.iter().map(|p| FrontPoint { value: p.value, time: p.time, error: p.error }).collect())
     }
+}
+
+/// Whether a scene may have this value of a knob, and keeps it: a range says nothing of what lies between whole numbers, or of one left out.
+fn is_taken(knob: &registry::Knob, value: f64) -> bool {
+    let mut scene = Scene::builtin_default();
+    (knob.set)(&mut scene, value);
+    // a table of an effect that the scene leaves out says so
+    scene.effects.entry("breathing".into()).or_insert(EffectSetting::Switch(false));
+    (knob.get)(&scene) == value && Scene::parse("a value of a front", &scene.to_toml()).is_ok()
 }
 
 #[cfg(test)]
@@ -120,10 +142,29 @@ mod tests {
                 "{{\"fronts\": [{{\"knob\": \"rendering.step\", \"points\": [{{\"value\": {value}, \"time\": {time}, \"error\": {error}}}]}}]}}"
             )
         };
+        // an order between two that exist, half an order, and no points at all
+        let order = |value: f64| {
+            let point = format!("{{\"value\": {value}, \"time\": 1.0, \"error\": 0.1}}");
+            format!("{{\"fronts\": [{{\"knob\": \"deformation.sampling_order\", \"points\": [{point}]}}]}}")
+        };
+        let [second, half] = [2.0, 1.5].map(order);
+        let pointless = "{\"fronts\": [{\"knob\": \"rendering.step\", \"points\": []}]}";
+        fs::write(&path, order(3.0)).unwrap();
+        assert!(Fronts::open(Some(&path)).is_ok());
         let [negative, frozen, beyond] = [point(1.0, -1.0, 0.5), point(1.0, 0.5, -0.5), point(1e9, 0.5, 0.5)];
-        for text in
-            ["", "{}", "{\"fronts\": []}", &negative, &frozen, &beyond, misspelt, "{\"fronts\": [{\"points\": [{\"value\": null}]}]}"]
-        {
+        for text in [
+            "",
+            "{}",
+            "{\"fronts\": []}",
+            &negative,
+            &frozen,
+            &beyond,
+            &second,
+            &half,
+            pointless,
+            misspelt,
+            "{\"fronts\": [{\"points\": [{\"value\": null}]}]}",
+        ] {
             fs::write(&path, text).unwrap();
             let said = Fronts::open(Some(&path)).unwrap_err().to_string();
             assert!(said.contains("maille tradeoff") && said.contains("fronts"), "{said}");
