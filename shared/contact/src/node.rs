@@ -39,6 +39,9 @@ const GAP_MM: f64 = 1.5;
 const OWN_GAP_MM: f64 = 0.3;
 /// Time constant of the material under the tip [s]: a tip that slides from mucosa to bone feels no step.
 const MATERIAL_S: f64 = 0.025;
+/// Largest change of a force by that alone, as a part of it or of [`MATERIAL_FORCE_N`] [1/s]: 3 % a tick.
+const MATERIAL_PER_S: f64 = 30.0;
+const MATERIAL_FORCE_N: f64 = 0.5;
 /// Depth over which damping sets in [mm], so that touching is no step.
 const DAMPING_DEPTH_MM: f64 = 0.5;
 /// The material is read this far below the surface [mm]: at the surface itself every tissue has the threshold's value.
@@ -295,7 +298,13 @@ impl Node {
     ) -> V3 {
         let value = tissue.value((point - normal * MATERIAL_DEPTH_MM).into()).unwrap_or(now.threshold);
         let here = now.config.tissue.at(value);
-        let material = self.material.map_or(here, |last| last.between(&here, now.dt / (now.dt + MATERIAL_S)));
+        let material = self.material.map_or(here, |last| {
+            let share = now.dt / (now.dt + MATERIAL_S);
+            // skin that gets thin over bone is ten times as stiff within a millimetre: its force grows by parts of itself
+            let (was, is) = (last.normal_force(delta, slope), last.between(&here, share).normal_force(delta, slope));
+            let most = MATERIAL_PER_S * was.max(MATERIAL_FORCE_N) * now.dt;
+            last.between(&here, share * (most / (is - was).abs().max(most)))
+        });
         self.material = Some(material);
         self.slope_n_per_mm = material.stiffness_n_per_mm + 2.0 * material.stiffening_n_per_mm2 * delta;
         let damping = material.damping_n_s_per_mm.min(now.damping_n_s_per_mm) * (delta / DAMPING_DEPTH_MM).min(1.0);
